@@ -10,6 +10,9 @@ use wire::{WalkConditions, WalkId};
 
 use crate::filter::StructureProperties;
 
+/// Version of the potential that drove the walk of a frame; only in campaigns with several versions.
+const VERSION: &str = "calmwalk_version";
+
 /// The retry adjustments without those of memory, time and nodes: they depend on the machine and change no label, and an export has
 /// the same bytes whatever was killed.
 fn of_calculation(names: &[String]) -> Vec<&str> {
@@ -94,6 +97,8 @@ fn add_label(frame: &mut Frame, label: Label, keys: LabelKeys) {
 
 /// Adds what is known of the origin of a structure.
 fn add_source(frame: &mut Frame, source: ExportSource, conditions: &BTreeMap<WalkId, WalkConditions>) {
+    // Walks with later versions have higher numbers.
+    let has_versions = conditions.values().next_back().is_some_and(|last| last.version > 0);
     let mut info = |key: &str, value: ExtxyzValue| frame.info.insert(key.to_owned(), value);
     match source {
         ExportSource::Candidate {
@@ -118,6 +123,10 @@ fn add_source(frame: &mut Frame, source: ExportSource, conditions: &BTreeMap<Wal
                 }
                 info("temperature", conditions.temperature.into());
                 info("tau", conditions.tau.into());
+            }
+            if has_versions {
+                let version = conditions.get(&view.id().walk).map_or(0, |conditions| conditions.version);
+                info(VERSION, i64::from(version).into());
             }
             info("mixture_version", integer(mixture_version_after));
             info("mixture_version_seen", integer(view.mixture_version()));
@@ -144,7 +153,63 @@ fn integer(number: u64) -> ExtxyzValue {
 
 #[cfg(test)]
 mod tests {
+    use atoms::{Cell, Structure};
+    use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin};
+
     use super::*;
+
+    /// A candidate of walk 1.
+    fn candidate() -> ExportSource {
+        let structure = Structure {
+            species: vec!["Al".parse().unwrap()],
+            positions: vec![[0.0; 3]],
+            cell: Cell::orthorhombic(4.0, 4.0, 4.0),
+            periodic: [true; 3],
+        };
+        let content = ContentHash::from_structure(&structure);
+        let block = CandidateBlock::encode(&Candidate {
+            id: CandidateId { campaign: CampaignId([7; 16]), walk: WalkId(1), segment: 0, step: 5, content },
+            origin: Origin::Biased,
+            mixture_version: 0,
+            temperature: 300.0,
+            relative_volume: 1.0,
+            energy: -1.0,
+            virial: [[0.0; 3]; 3],
+            structure,
+            forces: vec![[0.0; 3]],
+            gamma: vec![1.5],
+            gamma_nbr: vec![1.5],
+            features: Vec::new(),
+        });
+        ExportSource::Candidate {
+            id: "07070707-1.0.5-0123456789abcdef".into(),
+            seed_structure: 0,
+            seed_structure_name: "fcc".into(),
+            origin: Origin::Biased,
+            mixture_version_after: 1,
+            block,
+            original: Default::default(),
+        }
+    }
+
+    #[test]
+    fn frames_have_their_version_if_there_are_several() {
+        let version_in = |versions: [u32; 3]| {
+            let walk =
+                |(walk, version)| (WalkId(walk), WalkConditions { version, ..WalkConditions::default() });
+            let conditions: BTreeMap<_, _> = (0..).zip(versions).map(walk).collect();
+            let structure = match candidate() {
+                ExportSource::Candidate { block, .. } => block.view().structure(),
+                ExportSource::Import { .. } => unreachable!("it is a candidate"),
+            };
+            let mut frame = Frame::from(structure);
+            add_source(&mut frame, candidate(), &conditions);
+            frame.info.get(VERSION).cloned()
+        };
+        assert_eq!(version_in([0, 0, 0]), None);
+        assert_eq!(version_in([0, 0, 1]), Some(0_i64.into()));
+        assert_eq!(version_in([0, 2, 2]), Some(2_i64.into()));
+    }
 
     #[test]
     fn adjustments_of_resources_are_left_out() {

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use ::upfit::{LabelledFrame, UpfitError};
 use atoms::extxyz::Frame;
 use serde::Serialize;
+use tokio_util::sync::CancellationToken;
 
 use crate::exit_status::CommandError;
 use crate::file_hash;
@@ -43,17 +44,38 @@ pub fn command_error(error: UpfitError) -> CommandError {
 }
 
 /// The labelled structures of all files.
+/// Refuses files whose formats have no labels. The name shows the format, with or without the extension of a compression.
+pub fn check_formats<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<(), CommandError> {
+    for path in paths {
+        let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+        let name = name.strip_suffix(".gz").or_else(|| name.strip_suffix(".zst")).unwrap_or(&name);
+        if ![".xyz", ".extxyz"].iter().any(|ending| name.ends_with(ending)) {
+            return Err(CommandError::Input(format!(
+                "{}: POSCAR files and dumps of LAMMPS have no labels; expected extended XYZ with energy and forces, a name that ends in \
+                 .extxyz or .xyz, with or without .gz or .zst",
+                path.display()
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// The labelled structures of all files; `None` if it was asked to stop.
 ///
 /// # Errors
 /// A structure that cannot be read; labels that [`LabelledFrame::new`] refuses.
 pub fn read_frames(
     files: &StructureFiles,
     validation: bool,
-) -> Result<(Vec<LabelledFrame>, Vec<DataFile>), CommandError> {
+    stop: &CancellationToken,
+) -> Result<Option<(Vec<LabelledFrame>, Vec<DataFile>)>, CommandError> {
     let mut reader = files.reader(Arc::default());
     let (mut frames, mut counts) = (Vec::new(), vec![0; files.files.len()]);
     let mut stresses_left_out = 0_u64;
     while let Some((frame, file)) = reader.next()? {
+        if stop.is_cancelled() {
+            return Ok(None);
+        }
         counts[reader.file_index()] += 1;
         let (labelled, has_stress) = labelled_frame(frame, &file)?;
         stresses_left_out += u64::from(has_stress && labelled.stress.is_none());
@@ -73,7 +95,7 @@ pub fn read_frames(
         Ok(DataFile { file: name, hash, structures, weight: file.weight, validation })
     };
     let sources = files.files.iter().zip(counts).map(file).collect::<Result<_, _>>()?;
-    Ok((frames, sources))
+    Ok(Some((frames, sources)))
 }
 
 /// The frame with its labels, and whether these have a stress.

@@ -5,12 +5,13 @@ use std::fmt;
 use calm::forgetting::GradeDistribution;
 use monitor::end_reason::CampaignEnd;
 use monitor::label_statistics::{self, ErrorsByGrade, LabelStatistics};
+use monitor::versions::CampaignVersions;
 use monitor::walk_ends::WalkEnds;
 use store::{CampaignStatus, Store, StoreError, Unlabelled};
 use wire::ContentHash;
 
 use crate::output::{count, decimals};
-use crate::wording::{budget, end_reason, energies, unlabelled, walk_ends};
+use crate::wording::{budget, end_reason, energies, unlabelled, versions, walk_ends};
 
 /// Largest number of seed structures with failed labels to show.
 const MAX_SHOWN: usize = 8;
@@ -26,18 +27,21 @@ pub struct Summary {
     unlabelled: Vec<Unlabelled>,
     /// Grades of the training frames under the newest mixture, if they are monitored.
     training: Option<GradeDistribution>,
+    /// Versions of the potential.
+    versions: CampaignVersions,
 }
 
 /// Reads the summary of a campaign with the labels of one protocol.
 pub async fn read(store: &Store, protocol: ContentHash) -> Result<Summary, StoreError> {
     let status = store.status().await?;
     let end = CampaignEnd::read(store, &status).await?;
-    let statistics = label_statistics::read(store, protocol).await?;
+    let statistics = label_statistics::read(store, protocol, None).await?;
     let unlabelled = store.unlabelled(protocol, true).await?;
     let values = store.values().await?;
     let watched = values.iter().find(|(name, _)| name == "training_frames");
     let watched: Option<GradeDistribution> = watched.and_then(|(_, text)| serde_json::from_str(text).ok());
-    Ok(Summary { status, end, statistics, unlabelled, training: watched })
+    let versions = CampaignVersions::read(store, &status, &values).await?;
+    Ok(Summary { status, end, statistics, unlabelled, training: watched, versions })
 }
 
 impl fmt::Display for Summary {
@@ -50,6 +54,7 @@ impl fmt::Display for Summary {
             writeln!(f, "budget           {budget}")?;
         }
         self.write_mixture(f)?;
+        self.write_versions(f)?;
         self.write_errors(f)
     }
 }
@@ -100,7 +105,8 @@ impl Summary {
         };
         writeln!(
             f,
-            "labels           {} biased and {} control structures labelled{}, {} failed, {} dropped{superseded}{excluded}",
+            "labels           {}{} biased and {} control structures labelled{}, {} failed, {} dropped{superseded}{excluded}",
+            versions_note(statistics),
             statistics.biased.structures + statistics.shared,
             statistics.control.structures + statistics.shared,
             shared_note(statistics),
@@ -122,8 +128,22 @@ impl Summary {
         Ok(())
     }
 
+    fn write_versions(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Some(in_force) = self.versions.in_force() else { return Ok(()) };
+        writeln!(f, "potential        {}", versions::in_force(&self.versions, in_force))?;
+        for refused in self.versions.all.iter().filter(|version| !version.is_registered()) {
+            writeln!(f, "                 {}", versions::refused(refused))?;
+        }
+        writeln!(f, "errors of each version of the potential, and how they changed:")?;
+        versions::table(&self.versions).lines().try_for_each(|line| writeln!(f, "  {line}"))
+    }
+
     fn write_errors(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "force error of the potential against the grade of the original mixture:")?;
+        let version = match self.statistics.version {
+            Some(version) => format!("version {version} of the potential"),
+            None => "the potential".to_owned(),
+        };
+        writeln!(f, "force error of {version} against the grade of the original mixture:")?;
         writeln!(
             f,
             "           atoms   mean error   γ > 1   γ_nbr > 1   ρ(γ, error)   ρ(γ_nbr, error)   ROC-AUC(γ)   ROC-AUC(γ_nbr)"
@@ -136,6 +156,13 @@ impl Summary {
         }
         writeln!(f, "{}", energies::offsets(&energy.offsets))
     }
+}
+
+/// The labels of all versions of the potential, before those of the version that the statistics are of.
+fn versions_note(statistics: &LabelStatistics) -> String {
+    let Some(version) = statistics.version else { return String::new() };
+    let all: u64 = statistics.by_version.values().map(|grades| grades.structures).sum();
+    format!("{} in all; of walks with version {version}: ", count(all, "label"))
 }
 
 /// Says that structures found by both biased and control walks are counted twice.

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use calm::{Grades, Mixture};
 use orchestrator::selector::{SelectorSettings, UpdateProtocol, update_settings_in_force};
 use potentials::grace::GraceModel;
-use store::{CampaignRecord, ExportCursor, ExportFilter, Fate, Store, StoredCandidate};
+use store::{CampaignRecord, Fate, Store, StoredCandidate};
 use tokio_util::sync::CancellationToken;
 
 use crate::exit_status::CommandError;
@@ -19,8 +19,6 @@ use crate::replay::recorded_settings;
 
 /// Candidates per read; their features are not needed, but are read with them.
 const CANDIDATES: u32 = 16;
-/// Labelled structures per read.
-const LABELLED: u32 = 200;
 
 /// A mixture after the updates, and what the candidates did to it.
 pub struct MixtureAfterUpdates {
@@ -60,12 +58,13 @@ pub fn updating_settings(campaign: &CampaignRecord) -> Result<SelectorSettings, 
     Ok(settings)
 }
 
-/// Applies the candidates in decision order, each by the campaign's rules, as its selector did: those that meet the collection rule
-/// under the mixture so far update it. Features are those of `model`, to which `mixture` belongs. `None` after a cancellation of `stop`.
+/// Applies the candidates in decision order by the campaign's rules: those that meet the collection rule under the mixture so far
+/// update it. Features are those of `model`, to which `mixture` belongs. `None` after a cancellation of `stop`.
 ///
 /// Warns of a candidate that the model cannot evaluate or the mixture cannot take up, and goes on.
 ///
-/// A candidate counts as labelled if `calmwalk export` writes it under the protocol in force.
+/// A candidate counts as labelled if `calmwalk export` writes it under the protocol in force. Updates are as the campaign's are now:
+/// once it has switched to additive ones, also those by earlier candidates are additive.
 ///
 /// # Errors
 /// A campaign that never updates its mixture, a damaged database.
@@ -75,8 +74,17 @@ pub async fn apply(
     mixture: Mixture,
     stop: &CancellationToken,
 ) -> Result<Option<MixtureAfterUpdates>, CommandError> {
-    let labelled = labelled(store).await?;
-    apply_others(store, model, mixture, &labelled, stop).await
+    let mut updater = CandidateUpdater::new(store, model, mixture, stop).await?;
+    let protocol = store.protocol_in_force().await?.map(|protocol| protocol.hash);
+    let mut last = 0;
+    loop {
+        let page = store.candidates_without_label(protocol, last, CANDIDATES).await?;
+        let Some(end) = page.last() else { return Ok(Some(updater.found)) };
+        last = end.decision;
+        if !updater.apply_all(page.iter()) {
+            return Ok(None);
+        }
+    }
 }
 
 /// As [`apply`], for all accepted candidates but those of the decisions in `known`.
@@ -87,49 +95,48 @@ pub async fn apply_others(
     known: &HashSet<i64>,
     stop: &CancellationToken,
 ) -> Result<Option<MixtureAfterUpdates>, CommandError> {
-    let record = store.campaign().await?;
-    let settings = updating_settings(&record)?;
-    let search = update_settings_in_force(&settings.search, &store.values().await?);
-    let campaign = record.id.to_string();
-    let found = MixtureAfterUpdates { campaign, mixture, applied: 0, covered: 0, left_out: 0 };
-    let calculator = FeatureCalculator::new(Arc::clone(model));
-    let mut updater =
-        CandidateUpdater { settings, search, calculator, grades: Grades::default(), found, stop };
+    let mut updater = CandidateUpdater::new(store, model, mixture, stop).await?;
     let mut last = 0;
     loop {
         let page = store.candidates(last, false, CANDIDATES).await?;
         let Some(end) = page.last() else { return Ok(Some(updater.found)) };
         last = end.decision;
-        let unlabelled = |candidate: &&StoredCandidate| {
+        let is_other = |candidate: &&StoredCandidate| {
             candidate.fate == Fate::Accepted && !known.contains(&candidate.decision)
         };
-        for candidate in page.iter().filter(unlabelled) {
-            if updater.stop.is_cancelled() {
-                return Ok(None);
-            }
-            updater.apply_or_warn(candidate);
+        if !updater.apply_all(page.iter().filter(is_other)) {
+            return Ok(None);
         }
     }
 }
 
-/// The decisions on candidates that have a label, as an export has them.
-async fn labelled(store: &Store) -> Result<HashSet<i64>, CommandError> {
-    let mut found = HashSet::new();
-    let Some(protocol) = store.protocol_in_force().await? else { return Ok(found) };
-    let filter = ExportFilter { protocol: protocol.hash, biased: true, control: false, imported: false };
-    let mut last = None;
-    loop {
-        let page = store.labelled(&filter, last, LABELLED).await?;
-        let Some(end) = page.last() else { return Ok(found) };
-        last = Some(end.cursor);
-        found.extend(page.iter().filter_map(|row| match row.cursor {
-            ExportCursor::Candidate(decision) => Some(decision),
-            ExportCursor::Import(_) => None,
-        }));
+impl<'a> CandidateUpdater<'a> {
+    async fn new(
+        store: &Store,
+        model: &Arc<GraceModel>,
+        mixture: Mixture,
+        stop: &'a CancellationToken,
+    ) -> Result<Self, CommandError> {
+        let record = store.campaign().await?;
+        let settings = updating_settings(&record)?;
+        let search = update_settings_in_force(&settings.search, &store.values().await?);
+        let campaign = record.id.to_string();
+        let found = MixtureAfterUpdates { campaign, mixture, applied: 0, covered: 0, left_out: 0 };
+        let calculator = FeatureCalculator::new(Arc::clone(model));
+        Ok(Self { settings, search, calculator, grades: Grades::default(), found, stop })
     }
-}
 
-impl CandidateUpdater<'_> {
+    /// Applies these candidates in order. Returns false if it was stopped.
+    fn apply_all<'c>(&mut self, candidates: impl Iterator<Item = &'c StoredCandidate>) -> bool {
+        for candidate in candidates {
+            if self.stop.is_cancelled() {
+                return false;
+            }
+            self.apply_or_warn(candidate);
+        }
+        true
+    }
+
     fn apply_or_warn(&mut self, candidate: &StoredCandidate) {
         if let Err(error) = self.apply(candidate) {
             let (campaign, id) = (&self.found.campaign, candidate.block.view().id());

@@ -2,11 +2,11 @@
 
 use std::fs::{self, File};
 use std::io;
-use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use potentials::grace::TrainableGrace;
 use serde_json::{Map, Value, json};
+use tokio_util::sync::CancellationToken;
 use upfit::{LabelledFrame, TrainingData, TrainingEvent, UpfitError, UpfitOutcome, UpfitSettings, data_hash};
 
 use crate::atomic_file::{AtomicFile, cannot_write};
@@ -30,25 +30,30 @@ pub struct UpfitRun {
 }
 
 impl UpfitRun {
-    /// Trains, or continues from the state, and writes the model; then calls `finish`, and removes the state. `None` if `on_event` asked
-    /// to stop; the same training continues later.
+    /// Trains, or continues from the state, and writes the model; before that calls `finish`, and then removes the state. `None` if
+    /// `stop` was cancelled; the same training continues later.
     ///
     /// # Errors
     /// Those of [`upfit::run`], as `to_error` makes them; a file that cannot be written; `finish`'s.
-    pub fn run(
+    pub fn run<E: From<CommandError>>(
         self,
-        on_event: impl FnMut(TrainingEvent<'_>) -> ControlFlow<()>,
+        stop: &CancellationToken,
+        mut show: impl FnMut(&TrainingEvent<'_>),
         finish: impl FnOnce(&UpfitOutcome) -> Result<(), CommandError>,
-        to_error: fn(UpfitError) -> CommandError,
-    ) -> Result<Option<UpfitOutcome>, CommandError> {
+        to_error: fn(UpfitError) -> E,
+    ) -> Result<Option<UpfitOutcome>, E> {
         let Self { model, data, note, settings, output, checkpoint } = self;
-        let trained = upfit::run(model, &data, &settings, Some(&checkpoint), on_event);
+        let is_stopped = || stop.is_cancelled();
+        let trained =
+            upfit::run(model, &data, &settings, Some(&checkpoint), &is_stopped, |event| show(&event));
         let Some(outcome) = trained.map_err(to_error)? else { return Ok(None) };
         finish(&outcome)?;
         write_model(&outcome.model, &output, &note.to_string())?;
         // Without the model, the checkpoint would be needed.
         match fs::remove_file(&checkpoint) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => Err(cannot_write(&checkpoint, error)),
+            Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                Err(cannot_write(&checkpoint, error).into())
+            }
             _ => Ok(Some(outcome)),
         }
     }
@@ -79,9 +84,12 @@ pub fn note(
 
 /// Writes the model to a file beside its target first, so that the target appears complete or not at all.
 fn write_model(model: &TrainableGrace, output: &Path, note: &str) -> Result<(), CommandError> {
+    let output = &output.canonicalize().unwrap_or_else(|_| output.to_owned());
     let parent = output.parent().filter(|parent| !parent.as_os_str().is_empty());
+    // The next start removes it if this process is killed.
+    let prefix = format!(".{}.", output.file_name().unwrap_or_default().to_string_lossy());
     let mut builder = tempfile::Builder::new();
-    let part = builder.prefix(".upfit.").suffix(".part").tempfile_in(parent.unwrap_or(Path::new(".")));
+    let part = builder.prefix(&prefix).suffix(".part").tempfile_in(parent.unwrap_or(Path::new(".")));
     let part = part.map_err(|error| cannot_write(output, error))?.into_temp_path();
     model.write(&part, note).map_err(|error| cannot_write(output, error))?;
     // The checkpoint is removed afterwards, so the model must be readable.

@@ -161,6 +161,15 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     // An unknown protocol.
     let wrong = common::refuse(here, ["force-errors", "whole", "--protocol", "nothing"]);
     assert!(wrong.contains("no protocol 'nothing'; it has 'potential'"), "{wrong}");
+    // All walks have version 0 of the potential.
+    for command in ["force-errors", "report"] {
+        let wrong = common::refuse(here, [command, "whole", "--version", "3"]);
+        assert!(
+            wrong.contains("--version 3: no walk has this version") && wrong.contains("one of 0"),
+            "{wrong}"
+        );
+    }
+    assert!(errors["version"].is_null() && errors["by_version"].is_null(), "{errors}");
 }
 
 #[test]

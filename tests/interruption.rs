@@ -39,6 +39,28 @@ fn with_program(small: &Small, directory: &Path) {
     std::fs::write(small.write(directory), small.text().replace("[label]\nmethod", &keys)).unwrap();
 }
 
+/// Writes a campaign that trains two versions of its potential.
+fn with_versions(small: &Small, directory: &Path) {
+    let seed_frames = std::fs::read_to_string(common::config("data/al_eam_1l/seed_frames.extxyz")).unwrap();
+    let replay: Vec<&str> = seed_frames.lines().take(6 * 110).collect();
+    std::fs::write(directory.join("replay.extxyz"), replay.join("\n") + "\n").unwrap();
+    let refit = r#"
+[refit]
+replay = ["replay.extxyz"]
+after_structures = 5
+max_versions = 2
+held_out = 0.5
+max_held_out_error_ratio = 10.0
+max_attempts = 100
+control_frames = "compare"
+start = "first"
+method = { native = { epochs = 2, validation_share = 0.0 } }
+test_sets = [{ name = "known", file = "replay.extxyz" }]
+comparisons = [{ name = "known", file = "replay.extxyz" }]
+"#;
+    std::fs::write(small.write(directory), small.text() + refit).unwrap();
+}
+
 /// Runs a campaign without interruption in a single process. Returns its outcome and duration.
 fn uninterrupted_outcome(small: &Small, write: Write) -> (Outcome, Duration) {
     let directory = tempfile::tempdir().unwrap();
@@ -56,13 +78,14 @@ const PROGRAMS: u64 = 2;
 /// whether it was a labelling program.
 fn kill(directory: &Path, running: &Running, choice: u64, programs_too: bool) -> bool {
     const ALL: u64 = 3;
-    let kind = choice % 6;
+    let kind = choice % 7;
     let mut victims = match kind {
         0 => vec![running.0.id()],
         1 => processes_running(directory, "walker"),
         2 => processes_running(directory, "labeller"),
         ALL => processes_in(directory).iter().map(|process| process.pid).collect(),
         4 => processes_running(directory, "calculation-runner"),
+        6 => processes_running(directory, "refitter"),
         _ if programs_too => {
             let scratch = directory.canonicalize().unwrap().join("scratch");
             calculation_processes(&scratch)
@@ -77,14 +100,14 @@ fn kill(directory: &Path, running: &Running, choice: u64, programs_too: bool) ->
     if victims.is_empty() {
         victims.push(running.0.id());
     } else if kind != ALL {
-        victims = vec![victims[(choice / 6) as usize % victims.len()]];
+        victims = vec![victims[(choice / 7) as usize % victims.len()]];
     }
     victims.into_iter().for_each(|pid| signal(pid, "KILL"));
     is_program
 }
 
 /// Runs campaigns with some kills in each, at any time from the start on, with one or two walkers.
-fn disturbed(small: &Small, write: Write, options: &[&str], kills: u64) {
+fn disturbed(small: &Small, write: Write, options: &[&str], kills: u64) -> Outcome {
     let (expected, takes) = uninterrupted_outcome(&Small { walkers: 1, ..small.clone() }, write);
     assert!(expected.decisions.matches("\"kind\":\"accepted\"").count() >= 4, "{}", expected.decisions);
     assert!(expected.decisions.contains("\"kind\":\"control\""));
@@ -118,6 +141,7 @@ fn disturbed(small: &Small, write: Write, options: &[&str], kills: u64) {
         assert_eq!(outcome(directory.path()), expected, "after {done} kills in {campaigns} campaigns");
         assert_no_leftovers(directory.path());
     }
+    expected
 }
 
 #[test]
@@ -133,6 +157,17 @@ fn kills_of_a_run_in_one_process_change_nothing() {
 #[test]
 fn kills_of_a_campaign_whose_labels_a_program_makes_change_nothing() {
     disturbed(&Small::default(), with_program, &[], kills().div_ceil(4));
+}
+
+#[test]
+fn kills_of_a_campaign_that_trains_its_potential_change_nothing() {
+    let small = Small { max_per_walk: 3, ..Small::default() };
+    let expected = disturbed(&small, with_versions, &[], kills().div_ceil(4));
+    let found: Vec<_> =
+        expected.versions.iter().map(|version| (version.number, version.state.name())).collect();
+    assert_eq!(found, [(1, "registered"), (2, "registered")], "{:?}", expected.versions);
+    assert!(expected.decisions.contains("\"kind\":\"version\""), "walks begin with the first");
+    assert!(expected.decisions.contains("superseded"), "{}", expected.decisions);
 }
 
 #[test]

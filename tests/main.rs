@@ -44,6 +44,7 @@ mod notify;
 mod places;
 mod processes;
 mod reference_check;
+mod refit;
 mod relabel;
 mod replay;
 mod scheduling;

@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::io::{BufRead, BufReader, Read};
+use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::process::Stdio;
 use std::sync::Arc;
@@ -69,6 +70,10 @@ fn the_loss_falls_and_the_number_of_threads_changes_no_byte() {
     for set in ["training", "validation"] {
         let loss = |when: &str| found[when][set]["loss"].as_f64().unwrap();
         assert!(loss("after") < loss("before"), "{printed}");
+        for error in ["energy_mae", "force_mae", "stress_mae"] {
+            let [before, after] = ["before", "after"].map(|when| found[when][set][error].as_f64().unwrap());
+            assert!(before > 0.0 && after > 0.0 && before != after, "{printed}");
+        }
     }
     assert_eq!((&found["updates"], &found["history"].as_array().unwrap().len()), (&4.into(), &2));
     // The labels' energies are a tenth larger, −0.34 eV/atom.
@@ -126,13 +131,20 @@ fn tables_say_what_was_trained() {
     let output = calmwalk(here, arguments("out.npz", &more));
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     let (printed, progress) = (String::from_utf8_lossy(&output.stdout), stderr(&output));
-    for expected in
-        ["training", "validation", "before", "after", "1 update in 1 epoch", "wrote out.npz", "calm build"]
-    {
+    for expected in [
+        "training",
+        "validation",
+        "before",
+        "after",
+        "stress MAE",
+        "1 update in 1 epoch",
+        "wrote out.npz",
+        "calm build",
+    ] {
         assert!(printed.contains(expected), "{printed}");
     }
     for expected in
-        ["2 structures to train with, 2 structures for validation", "another zero", "epoch 1: loss"]
+        ["2 structures to train with, 2 structures for validation", "another zero", "epoch 1: loss", "eV/Å³"]
     {
         assert!(progress.contains(expected), "{progress}");
     }
@@ -157,6 +169,9 @@ fn a_killed_or_stopped_training_goes_on_to_the_same_bytes() {
     signal(killed.0.id(), "KILL");
     killed.0.wait().unwrap();
     assert!(state.exists() && !here.join("out.npz").exists());
+    // A process that is killed while it writes leaves such files.
+    let parts = [".out.npz.aB3x9Z.part", ".out.npz.upfit.aB3x9Z.part"].map(|name| here.join(name));
+    parts.iter().for_each(|part| fs::write(part, "unfinished").unwrap());
 
     // Another training refuses the checkpoint.
     let message = refuse(here, arguments("out.npz", &[&more[..], &["--rng-seed", "7"]].concat()));
@@ -183,7 +198,7 @@ fn a_killed_or_stopped_training_goes_on_to_the_same_bytes() {
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     assert!(stderr(&output).contains("continuing from out.npz.upfit"), "{}", stderr(&output));
     assert!(fs::read(here.join("out.npz")).unwrap() == whole, "the models differ");
-    assert!(!state.exists());
+    assert!(!state.exists() && !parts.iter().any(|part| part.exists()));
 }
 
 #[test]
@@ -269,15 +284,38 @@ fn wrong_arguments_are_refused_before_any_work() {
     let whole = ["--validation-share", "0"];
     let and = |more: &'static [&'static str]| [&whole[..], more].concat();
     // Both frames belong to one seed structure.
-    wrong(&["--validation-share", "0.5"], "the validation set is empty");
+    wrong(
+        &["--validation-share", "0.5"],
+        "2 structures belong to one seed structure, fcc; expected at least 2",
+    );
     wrong(&and(&["--freeze", "no_such_weights"]), "begins with 'no_such_weights'; it has ");
     wrong(&and(&["--patience", "3"]), "--patience: expected a validation set");
     wrong(&and(&["--min-learning-rate", "1"]), "the smallest learning rate is 1");
+    wrong(&and(&["--epochs", "0"]), "--epochs");
+    wrong(&and(&["--epochs", "1", "--loss", "paper"]), "stage 2 of the loss begins after a share of 0.417");
     wrong(&["--validation-share", "1"], "up to, not including, 1");
     wrong(&["--validation", "missing.extxyz"], "missing.extxyz: cannot be opened");
     wrong(&and(&["--weight", "other.extxyz=2"]), "--weight other.extxyz: expected one of the files");
     wrong(&and(&["--figure", "data.extxyz"]), "data.extxyz is a file of training data");
-    wrong(&and(&["--figure", "out.npz"]), "out.npz: named for two outputs");
+    wrong(&and(&["--figure", "out.npz"]), "out.npz and out.npz: one file is named for two outputs");
+    wrong(&and(&["--figure", "./out.npz"]), "./out.npz and out.npz: one file is named for two outputs");
+    wrong(
+        &["--validation", "./data.extxyz"],
+        "./data.extxyz, a file of validation data, is the same file as data.extxyz, a file of training data",
+    );
+    symlink("data.extxyz", here.join("link.extxyz")).unwrap();
+    wrong(&["--validation", "link.extxyz"], "link.extxyz, a file of validation data, is the same file");
+    let linked = here.join("link.npz");
+    symlink(config(MODEL), &linked).unwrap();
+    let message = refuse(here, arguments("link.npz", &whole));
+    assert!(message.contains("link.npz is the model"), "{message}");
+    fs::remove_file(linked).unwrap();
+    for name in ["POSCAR", "CONTCAR.gz", "a.vasp", "walk.lammpstrj.zst", "dump.a"] {
+        fs::write(here.join(name), "").unwrap();
+        let reason =
+            format!("{name}: POSCAR files and dumps of LAMMPS have no labels; expected extended XYZ");
+        wrong(&["--validation", name], &reason);
+    }
     fs::write(here.join("notes.txt"), "no checkpoint").unwrap();
     let output = calmwalk(here, arguments("out.npz", &and(&["--checkpoint", "notes.txt"])));
     assert_eq!(output.status.code(), Some(1));

@@ -136,7 +136,7 @@ fn versions_are_listed_and_shown_with_their_errors() {
     let first = ["1", "registered,", "in", "force", "0", "native", "40", "12", "s", "0.25"];
     let date = ["2000-02-29", "12:34", "UTC"];
     assert_eq!(words(lines[2]), [&first[..], &date[..], &["0.3000", "0.0400"][..]].concat());
-    assert!(lines[3].contains("refused") && lines[4].contains("registered, not taken up yet"), "{list}");
+    assert!(lines[3].contains("refused") && lines[4].contains("registered, not taken up"), "{list}");
     assert_eq!(lines[5], "version 2 was refused: the loss is not finite");
     assert_eq!(succeed(here, ["versions", "here", "list"]), list);
     let json = json_of(here, []);
@@ -150,7 +150,7 @@ fn versions_are_listed_and_shown_with_their_errors() {
     let expected = ["held_out", "6", "force", "MAE", "(eV/Å)", "0.4000", "0.1000", "0.25", "version", "3"];
     assert_eq!(words(row), expected, "{shown}");
     let model = hash(b"model of version 3");
-    for part in ["version 3: registered, not taken up yet", model.as_str(), "epochs 5", "none yet"] {
+    for part in ["version 3: registered, not taken up", model.as_str(), "epochs 5", "none yet"] {
         assert!(shown.contains(part), "{shown}");
     }
     let shown = json_of(here, ["show", "0"]);

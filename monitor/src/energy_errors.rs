@@ -76,9 +76,9 @@ pub struct EnergySummary {
 }
 
 impl ProtocolEnergyOffsets {
-    /// Fits the element offsets to the labels of this protocol.
-    pub async fn fit(store: &Store, protocol: ContentHash) -> Result<Self, StoreError> {
-        energy_offsets(store, protocol).await.map(Self)
+    /// Fits the element offsets to the labels of this protocol from walks with this version of the potential.
+    pub async fn fit(store: &Store, protocol: ContentHash, version: u32) -> Result<Self, StoreError> {
+        energy_offsets(store, protocol, version).await.map(Self)
     }
 
     /// E_model − E_label per atom after removing the offsets, eV. `None` if too few labels support the composition.

@@ -8,15 +8,17 @@ use wire::ContentHash;
 /// Number of labels in the fit: the newest ones.
 const MAX_FIT_LABELS: u32 = 2_000;
 
-/// Fits the energy offsets of elements to the newest labels of a protocol, without excluded ones.
+/// Fits the energy offsets of elements to the newest labels of a protocol, without excluded ones, and the energies of one version
+/// of the potential: another version may have another zero.
 ///
 /// # Errors
 /// Errors of the database; in the inner result, [`TooFewLabels`] for a fit.
 pub async fn energy_offsets(
     store: &Store,
     protocol: ContentHash,
+    version: u32,
 ) -> Result<Result<EnergyOffsets, TooFewLabels>, StoreError> {
-    let labels = store.labelled_energies(protocol, MAX_FIT_LABELS).await?;
+    let labels = store.labelled_energies(protocol, version, MAX_FIT_LABELS).await?;
     let labels = labels.into_iter().map(|found| LabelledEnergy {
         composition: found.composition.iter().map(|(species, n)| (species.atomic_number(), *n)).collect(),
         model: found.model,

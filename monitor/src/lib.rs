@@ -2,8 +2,9 @@
 //!
 //! [`Snapshot`] is the state of a campaign; [`candidate_details`] the history of one candidate; [`label_statistics`]
 //! the potential's errors against labels; [`label_cost`] what labels cost; [`mixture_status`] how far the mixture has
-//! moved; [`improvement`] what a version of the potential gained; [`end_reason`] why the campaign ended. Nothing here writes to the store, and nothing renders: values leave as numbers, or as the JSON that the
-//! documents describe.
+//! moved; [`versions`] the versions of its potential, and [`improvement`] what one gained; [`end_reason`] why the
+//! campaign ended. Nothing here writes to the store, and nothing renders: values leave as numbers, or as the JSON that
+//! the documents describe.
 
 pub mod candidate_details;
 pub mod disk;
@@ -21,6 +22,7 @@ pub mod provenance;
 pub mod reference_check;
 pub mod snapshot;
 pub mod version_finds;
+pub mod versions;
 pub mod walk_ends;
 
 pub use snapshot::Snapshot;

@@ -10,6 +10,7 @@ use crate::label_queue::LabelQueue;
 use crate::mixture_values::MixtureValues;
 use crate::provenance::Provenance;
 use crate::reference_check::ReferenceCheck;
+use crate::versions::CampaignVersions;
 use crate::walk_ends::WalkEnds;
 
 /// Version of the JSON format; incremented when a key is removed or changes its meaning.
@@ -36,6 +37,8 @@ pub struct Snapshot {
     pub end_reason: Option<CampaignEnd>,
     /// The check of the reference. `None` if there was none.
     pub check: Option<ReferenceCheck>,
+    /// Versions of the potential.
+    pub versions: CampaignVersions,
 }
 
 impl Snapshot {
@@ -45,13 +48,15 @@ impl Snapshot {
         let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
         let (campaign, status) = (store.campaign().await?, store.status().await?);
         let labels = LabelQueue::read(store, &status).await?;
+        let values = store.values().await?;
         let configuration: Value = serde_json::from_str(&campaign.configuration_in_force).unwrap_or_default();
         Ok(Self {
             end_reason: CampaignEnd::read(store, &status).await?,
             end: ExpectedEnd::extrapolate(&status, &configuration, &labels.cost),
             origin: Provenance::read(store).await?,
             check: ReferenceCheck::read(store).await?,
-            mixture: MixtureValues(store.values().await?),
+            versions: CampaignVersions::read(store, &status, &values).await?,
+            mixture: MixtureValues(values),
             disk: DiskUse { bytes: store.size().await?, forecast },
             campaign,
             status,
@@ -61,7 +66,7 @@ impl Snapshot {
 
     /// The JSON of `calmwalk status` (docs/status.md), without the jobs of a batch system and without sentences.
     pub fn to_json(&self) -> serde_json::Result<Value> {
-        let Self { campaign, origin, status, mixture, disk, labels, end, end_reason, check } = self;
+        let Self { campaign, origin, status, mixture, disk, labels, end, end_reason, check, versions } = self;
         let mut json = serde_json::to_value(status)?;
         json["version"] = FORMAT.into();
         json["campaign"] = campaign.id.to_string().into();
@@ -79,6 +84,8 @@ impl Snapshot {
         json["expected_end"] = json!(end);
         json["end_reason"] = json!(end_reason);
         json["reference_check"] = check.as_ref().map_or(Value::Null, ReferenceCheck::to_json);
+        json["versions"] = json!(versions.all);
+        json["refit"] = json!(versions.refit);
         labels.add_to(&mut json, status);
         Ok(json)
     }

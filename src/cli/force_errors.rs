@@ -19,7 +19,9 @@ const NAMES: usize = 3;
 /// median and percentiles in bins of the grade, Spearman's ρ, and the area under the receiver operating characteristic
 /// (ROC-AUC) of the grade as a test for errors above 1 eV/Å. The errors of structures whose labels failed are unknown: these
 /// structures are counted separately ('without label') in their bins. Energy errors exclude a fitted offset per element, because
-/// labels and potential have different zeros of energy. Works while the campaign runs.
+/// labels and potential have different zeros of energy. In a campaign with several versions of the potential, all this is of the
+/// structures from walks with one version, and a table compares the versions, each by its own grades. Works while the campaign
+/// runs.
 #[derive(Debug, clap::Args)]
 pub struct ForceErrorsArgs {
     #[command(flatten)]
@@ -27,6 +29,9 @@ pub struct ForceErrorsArgs {
     /// Use the labels of this protocol [default: the current protocol]
     #[arg(long, value_name = "NAME")]
     protocol: Option<String>,
+    /// Use structures from walks with this version of the potential [default: the newest with labels]
+    #[arg(long, value_name = "N")]
+    version: Option<u32>,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -46,7 +51,10 @@ impl ForceErrorsArgs {
     async fn read(&self) -> Result<(Protocol, LabelStatistics), CommandError> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         let protocol = self.select_protocol(&store).await?;
-        let statistics = label_statistics::read(&store, protocol.hash).await?;
+        if let Some(version) = self.version {
+            check_version(&store, version).await?;
+        }
+        let statistics = label_statistics::read(&store, protocol.hash, self.version).await?;
         store.close().await;
         Ok((protocol, statistics))
     }
@@ -66,11 +74,28 @@ impl ForceErrorsArgs {
     }
 }
 
+/// Refuses a version that drives no walk.
+///
+/// # Errors
+/// The campaign has no walk with it.
+pub async fn check_version(store: &Store, version: u32) -> Result<(), CommandError> {
+    let numbers: Vec<u32> = store.walk_versions().await?.numbers().collect();
+    if numbers.contains(&version) {
+        return Ok(());
+    }
+    let numbers: Vec<_> = numbers.iter().map(u32::to_string).collect();
+    Err(CommandError::Input(format!(
+        "--version {version}: no walk has this version of the potential; expected one of {}",
+        numbers.join(", ")
+    )))
+}
+
 fn write(out: &mut dyn Write, protocol: &Protocol, statistics: &LabelStatistics) -> io::Result<()> {
-    let LabelStatistics { all, .. } = statistics;
+    let LabelStatistics { all, version, .. } = statistics;
+    let version = version.map_or(String::new(), |version| format!(", version {version} of the potential"));
     writeln!(
         out,
-        "force error |F_model − F_label| by grade under the original mixture, protocol '{}'",
+        "force error |F_model − F_label| by grade under the original mixture, protocol '{}'{version}",
         protocol.name
     )?;
     write_correlations(out, statistics)?;
@@ -90,6 +115,7 @@ fn write(out: &mut dyn Write, protocol: &Protocol, statistics: &LabelStatistics)
         writeln!(out, "excluded: {gamma} atoms without a finite γ, {gamma_nbr} without a finite γ_nbr")?;
     }
     write_energies(out, statistics)?;
+    write_versions(out, statistics)?;
     for (name, errors) in [("γ", &all.gamma), ("γ_nbr", &all.gamma_nbr)] {
         write_bins(out, name, &errors.bins())?;
     }
@@ -133,6 +159,43 @@ fn write_energies(out: &mut dyn Write, statistics: &LabelStatistics) -> io::Resu
         writeln!(out, "energy error |E_model − E_label|: {line}")?;
     }
     writeln!(out, "{}", wording::energies::offsets(&energies.offsets))
+}
+
+/// A table of the versions, each by the grades of its own mixture.
+fn write_versions(out: &mut dyn Write, statistics: &LabelStatistics) -> io::Result<()> {
+    if statistics.by_version.is_empty() {
+        return Ok(());
+    }
+    let mut table = TextTable::new(&[
+        ">version",
+        ">structures",
+        ">atoms",
+        ">mean (eV/Å)",
+        ">median",
+        ">ρ(γ)",
+        ">ρ(γ_nbr)",
+        ">ROC-AUC(γ)",
+        ">ROC-AUC(γ_nbr)",
+    ]);
+    for (version, grades) in &statistics.by_version {
+        let ErrorsByGrade { structures, gamma, gamma_nbr } = grades;
+        table.push(vec![
+            version.to_string(),
+            structures.to_string(),
+            gamma.atoms().to_string(),
+            decimals(gamma.mean(), 3),
+            decimals(gamma.median(), 3),
+            decimals(gamma.spearman(), 3),
+            decimals(gamma_nbr.spearman(), 3),
+            decimals(gamma.roc_auc(), 3),
+            decimals(gamma_nbr.roc_auc(), 3),
+        ]);
+    }
+    writeln!(
+        out,
+        "\nby version of the potential, each by its own grades, of the structures of its own walks:"
+    )?;
+    table.write(out)
 }
 
 fn write_bins(out: &mut dyn Write, name: &str, bins: &[ErrorBin]) -> io::Result<()> {

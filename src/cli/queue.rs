@@ -5,7 +5,7 @@ mod files;
 use std::io::{self, Write};
 use std::path::PathBuf;
 
-use store::{Attempt, JobDetails, JobState, Location, QueueEntry, Store, unix_milliseconds};
+use store::{Attempt, JobDetails, JobState, Location, QueueEntry, Store, WalkVersions, unix_milliseconds};
 
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{TextTable, count, decimals, print, print_json};
@@ -88,8 +88,12 @@ impl QueueArgs {
         let location = &self.location.get()?;
         match &self.action {
             QueueCommand::List(list) => {
-                let jobs = block_on(read_list(location, list))??;
-                if self.json { print_json(&jobs)? } else { print(|out| write_list(out, &jobs, list))? }
+                let (jobs, versions) = block_on(read_list(location, list))??;
+                if self.json {
+                    print_json(&jobs)?
+                } else {
+                    print(|out| write_list(out, &jobs, &versions, list))?
+                }
             }
             QueueCommand::Show { id } => {
                 let details = block_on(read_details(location, id))??;
@@ -117,9 +121,13 @@ impl QueueArgs {
     }
 }
 
-async fn read_list(location: &Location, list: &QueueListArgs) -> Result<Vec<QueueEntry>, CommandError> {
+async fn read_list(
+    location: &Location,
+    list: &QueueListArgs,
+) -> Result<(Vec<QueueEntry>, WalkVersions), CommandError> {
     let store = Store::open_read_only(location).await?;
-    Ok(store.queue_list(list.state, list.limit, list.offset).await?)
+    let jobs = store.queue_list(list.state, list.limit, list.offset).await?;
+    Ok((jobs, store.walk_versions().await?))
 }
 
 async fn read_details(location: &Location, id: &str) -> Result<JobDetails, CommandError> {
@@ -173,7 +181,13 @@ fn state_of(job: &QueueEntry) -> String {
     }
 }
 
-fn write_list(out: &mut dyn Write, jobs: &[QueueEntry], list: &QueueListArgs) -> io::Result<()> {
+/// The version of the potential that found a structure is shown if there are several: their grades cannot be compared.
+fn write_list(
+    out: &mut dyn Write,
+    jobs: &[QueueEntry],
+    versions: &WalkVersions,
+    list: &QueueListArgs,
+) -> io::Result<()> {
     if jobs.is_empty() {
         let state = list.state.map_or(String::new(), |state| format!("{state} "));
         return match list.offset {
@@ -181,19 +195,12 @@ fn write_list(out: &mut dyn Write, jobs: &[QueueEntry], list: &QueueListArgs) ->
             offset => writeln!(out, "no {state}jobs after the first {offset}"),
         };
     }
-    let mut table = TextTable::new(&[
-        "id",
-        "state",
-        ">priority",
-        ">atoms",
-        "formula",
-        ">γ_max",
-        ">attempts",
-        ">failed",
-        "protocol",
-    ]);
+    let mut titles =
+        vec!["id", "state", ">priority", ">atoms", "formula", ">γ_max", ">attempts", ">failed", "protocol"];
+    titles.extend((!versions.is_single()).then_some(">version"));
+    let mut table = TextTable::new(&titles);
     for job in jobs {
-        table.push(vec![
+        let mut row = vec![
             job.candidate.clone(),
             state_of(job),
             job.priority.to_string(),
@@ -203,7 +210,9 @@ fn write_list(out: &mut dyn Write, jobs: &[QueueEntry], list: &QueueListArgs) ->
             job.attempts.to_string(),
             job.failures.to_string(),
             job.protocol.clone(),
-        ]);
+        ];
+        row.extend((!versions.is_single()).then(|| versions.of_candidate(&job.candidate).to_string()));
+        table.push(row);
     }
     table.write(out)?;
     if jobs.len() as u64 == u64::from(list.limit) {
@@ -301,4 +310,51 @@ fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
     difference.lines().try_for_each(|line| writeln!(out, "       {line}"))?;
     let log = log.as_deref().unwrap_or_default();
     log.lines().try_for_each(|line| writeln!(out, "       | {line}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn job(walk: u32) -> QueueEntry {
+        QueueEntry {
+            excluded: None,
+            job: 1,
+            candidate: format!("07070707-{walk}.0.5-0123456789abcdef"),
+            protocol: "dft".into(),
+            state: JobState::Queued,
+            priority: 10,
+            holder: None,
+            expires: None,
+            attempts: 0,
+            failures: 0,
+            atoms: 54,
+            formula: "Mo54".into(),
+            original_gamma: Some(1.5),
+            original_gamma_nbr: None,
+            origin: "biased".into(),
+            seed_structure: "bcc-100".into(),
+            walk,
+            step: 5,
+            temperature: Some(300.0),
+            relative_volume: Some(1.0),
+            overruled: false,
+            relabel: None,
+        }
+    }
+
+    #[test]
+    fn versions_are_listed_if_there_are_several() {
+        let text = |versions: [u32; 2]| {
+            let versions = WalkVersions::from_walks((0..).zip(versions));
+            let list = QueueListArgs { state: None, limit: 50, offset: 0 };
+            let mut out = Vec::new();
+            write_list(&mut out, &[job(0), job(1)], &versions, &list).unwrap();
+            String::from_utf8(out).unwrap()
+        };
+        let several = text([0, 2]);
+        let last: Vec<_> = several.lines().map(|line| line.split_whitespace().last().unwrap()).collect();
+        assert_eq!(last, ["version", "0", "2"], "{several}");
+        assert!(!text([0, 0]).contains("version"));
+    }
 }

@@ -16,8 +16,9 @@ use crate::refit::RefitOutcome;
 use crate::refit::process;
 use crate::refit::schedule::RefitSchedule;
 use crate::refit::settings::RefitterConfig;
-use crate::runtime::{refit_process, version_loop};
+use crate::runtime::refit_process;
 use crate::signals::stop_token;
+use crate::versions::VersionOnDisk;
 
 /// The name of the lock holder in messages of other processes.
 const HOLDER: &str = "calmwalk refit";
@@ -25,12 +26,13 @@ const HOLDER: &str = "calmwalk refit";
 /// Train a new version of a campaign's potential now, from the labels so far
 ///
 /// Does once, in this process, what calmwalk run does by itself when a refit is due (section [refit] of the configuration). It
-/// does not wait for after_structures or after_time, and trains beyond max_versions and stop.min_improvement. The new version is
-/// registered or refused by the same rules. An interrupted refit goes on with the same command.
+/// does not wait for after_structures or after_time, and trains beyond max_versions and stop.min_improvement; no walk starts with
+/// a version beyond them. The new version is registered or refused by the same rules. An interrupted refit goes on with the same
+/// command.
 ///
 /// Live mode: at any time. A campaign that runs takes the new version up. Reproducible mode: only when nothing runs the campaign,
 /// all its walks have ended and all its labels are final, so that the result does not depend on the moment. The next calmwalk run
-/// starts the walks of the new version.
+/// takes the new version up.
 ///
 /// Exit codes: 0 registered, or nothing is new since the last attempt; 1 refused, or another failure; 2 invalid input; 130
 /// interrupted.
@@ -46,7 +48,6 @@ pub struct RefitArgs {
 /// A refit that can begin.
 struct PreparedRefit {
     config: RefitterConfig,
-    mode: CampaignMode,
     /// So that nothing runs the campaign meanwhile.
     _lock: Option<CampaignLock>,
 }
@@ -56,20 +57,14 @@ impl RefitArgs {
         let location = self.location.get()?;
         warn_if_unencrypted(&location);
         let stop = stop_token()?;
-        let Some((outcome, mode)) = block_on(self.refit(&location, &stop))?? else {
+        let Some(outcome) = block_on(self.refit(&location, &stop))?? else {
             print(|out| writeln!(out, "no structure was accepted since the last attempt: nothing to do"))?;
             return Ok(ExitStatus::Done);
         };
         match outcome {
             RefitOutcome::Registered(version) => {
-                let then = match mode {
-                    CampaignMode::Live => "the campaign takes it up, at once if it runs",
-                    CampaignMode::Reproducible => "the next calmwalk run takes it up",
-                };
-                print(|out| {
-                    let (number, labels) = (version.number, count(version.labels, "label"));
-                    writeln!(out, "version {number} is registered, trained on {labels}: {then}")
-                })?;
+                let (number, labels) = (version.number, count(version.labels, "label"));
+                print(|out| writeln!(out, "version {number} is registered, trained on {labels}"))?;
                 Ok(ExitStatus::Done)
             }
             RefitOutcome::Refused(version) => Err(CommandError::Failed(format!(
@@ -88,13 +83,12 @@ impl RefitArgs {
         &self,
         location: &Location,
         stop: &CancellationToken,
-    ) -> Result<Option<(RefitOutcome, CampaignMode)>, CommandError> {
+    ) -> Result<Option<RefitOutcome>, CommandError> {
         let store = Store::open(location).await?;
         let prepared = self.prepare(&store, location).await;
         store.close().await;
         let Some(prepared) = prepared? else { return Ok(None) };
-        let outcome = process::run(&prepared.config, stop).await?;
-        Ok(Some((outcome, prepared.mode)))
+        process::run(&prepared.config, stop).await.map(Some)
     }
 
     async fn prepare(
@@ -115,18 +109,23 @@ impl RefitArgs {
             check_is_over(store, &campaign).await?;
         }
         check_is_alone(store).await?;
-        if !RefitSchedule::read(store, &campaign.config.stop).await?.has_news() {
+        let schedule = RefitSchedule::read(store, &campaign.config).await?;
+        if !schedule.has_news() {
             return Ok(None);
         }
         let directory = directory(location, known.as_ref())?;
-        let versioned = version_loop::in_force(&campaign, store, &directory).await?;
+        // The newest version, although no walk may have it.
+        let versioned = match schedule.newest() {
+            Some(newest) => campaign.with_version(VersionOnDisk::find(store, newest, &directory).await?)?,
+            None => campaign.clone(),
+        };
         let config = refit_process::configuration(&versioned, refit, &directory)?;
         // The campaign that the command line names, which may be a copy.
         let location = match location {
             Location::Directory(_) => config.directory.clone(),
             Location::Server(_) => self.location.location.clone(),
         };
-        Ok(Some(PreparedRefit { config: RefitterConfig { location, ..config }, mode, _lock: lock }))
+        Ok(Some(PreparedRefit { config: RefitterConfig { location, ..config }, _lock: lock }))
     }
 
     fn config_path(&self, known: Option<&Provenance>) -> Result<PathBuf, CommandError> {

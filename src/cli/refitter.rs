@@ -1,5 +1,7 @@
 //! `calmwalk refitter`
 
+use std::path::PathBuf;
+
 use orchestrator::launcher;
 
 use super::{CommandError, ExitStatus, block_on};
@@ -12,11 +14,19 @@ use crate::{log, process_config};
 ///
 /// Reads its settings from standard input. Exits with the process that started it; the next one continues.
 #[derive(Debug, clap::Args)]
-pub struct RefitterArgs {}
+pub struct RefitterArgs {
+    /// End the processes with this mark when standard input is closed, and do nothing else
+    #[arg(long, value_name = "MARK")]
+    end_marked: Option<PathBuf>,
+}
 
 impl RefitterArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         launcher::set_process_name(c"calmwalk").map_err(CommandError::failed)?;
+        if let Some(mark) = &self.end_marked {
+            refit::end_marked_when_alone(mark)?;
+            return Ok(ExitStatus::Done);
+        }
         let config: RefitterConfig = process_config::from_stdin()?;
         log::init(config.log.clone(), "refitter", None)?;
         if let Some(parent) = config.parent {

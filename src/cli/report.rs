@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use store::Store;
 
+use super::force_errors::check_version;
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{count, print};
 use crate::page::{create_directory, write_files};
@@ -22,6 +23,10 @@ pub struct ReportArgs {
     /// Directory for the files, created if it does not exist; files of an earlier report are replaced
     #[arg(long, short, value_name = "DIR", default_value = "report")]
     output: PathBuf,
+    /// Show grades, force errors and features of structures from walks with this version of the potential [default: the newest
+    /// with labels]
+    #[arg(long, value_name = "N")]
+    version: Option<u32>,
 }
 
 impl ReportArgs {
@@ -31,7 +36,10 @@ impl ReportArgs {
         create_directory(&self.output)?;
         let files = block_on(async {
             let store = Store::open_read_only(&location).await?;
-            let files = report::build(&store).await;
+            if let Some(version) = self.version {
+                check_version(&store, version).await?;
+            }
+            let files = report::build(&store, self.version).await;
             store.close().await;
             files
         })??;

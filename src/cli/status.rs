@@ -7,6 +7,7 @@ pub mod page;
 mod processes;
 #[cfg(test)]
 pub mod tests;
+mod versions;
 pub mod walks;
 
 use std::io::{self, Write};
@@ -39,8 +40,8 @@ pub struct StatusArgs {
     /// Print JSON
     #[arg(long)]
     json: bool,
-    /// Show all walks and processes, and what is forgotten of each element and component, instead of a selection that fits a
-    /// screen (JSON always contains all)
+    /// Show all walks, processes and versions of the potential, and what is forgotten of each element and component, instead of a
+    /// selection that fits a screen (JSON always contains all)
     #[arg(long)]
     all: bool,
     /// Number of walks to show, or all: running walks with the largest γ first [default: as many as fit a screen]
@@ -94,6 +95,7 @@ fn write(
     let page = page.fitted(lines, if matches!(jobs, BatchJobs::Known(_)) { 3 } else { 2 }, walks);
     let status = &snapshot.status;
     if page.is_unlimited() {
+        versions::write(out, &snapshot.versions, &page)?;
         mixture::write_forgetting(out, &snapshot.mixture, &page)?;
     }
     walks::write(out, &status.walks, status.run_active, &page)?;
@@ -102,7 +104,7 @@ fn write(
 }
 
 fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &StatusLayout) -> io::Result<()> {
-    let Snapshot { campaign, origin, status, mixture, disk, labels, check, .. } = snapshot;
+    let Snapshot { campaign, origin, status, mixture, disk, labels, check, versions, .. } = snapshot;
     let (name, mode) = (origin.as_ref().map_or("", |origin| &origin.name), &campaign.mode);
     let id = campaign.id.to_string();
     // Ids of candidates start with the same eight characters.
@@ -125,7 +127,9 @@ fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &StatusLayout) -> 
             ends.causes().map(|(cause, _)| format!("{}: try {}", walk_ends::cause(cause), cause.advice()));
         advice.take(page.few).try_for_each(|line| page.titled(out, "", &line))?;
     }
-    page.titled(out, "mixture", &format!("version {}", status.mixture_version))?;
+    versions::write_head(out, versions, page)?;
+    let potential = if page.is_unlimited() { String::new() } else { versions::short(versions) };
+    page.titled(out, "mixture", &format!("version {}{potential}", status.mixture_version))?;
     mixture::write(out, mixture, page, &campaign.mode)?;
     write_candidates(out, page, &status.candidates, mixture.left_out(), labels.shared)?;
     labels::write(out, labels, page, status)?;

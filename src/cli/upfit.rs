@@ -2,24 +2,21 @@
 
 mod display;
 mod figure;
+mod fine_tuning;
+mod left_parts;
+mod paths;
 mod report;
 
-use std::io::Write;
-use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use ::upfit::{CosineDecay, LossSettings, TrainingData, UpfitOutcome, UpfitSettings};
-use figures::to_svg;
-use potentials::grace::TrainableGrace;
+use ::upfit::{CosineDecay, LossSettings, UpfitSettings};
 
 use self::display::TrainingDisplay;
+use self::fine_tuning::{FineTuned, FineTuning, fine_tune};
 use super::{CommandError, ExitStatus};
-use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
-use crate::labelled_frames::{DataFile, command_error, read_frames};
-use crate::output::{count, print, print_json, print_stderr};
+use crate::output::{print, print_json, print_stderr};
 use crate::signals::stop_token;
 use crate::structure_files::{StructureReadingArgs, file_weight};
-use crate::upfit_run::{self, UpfitRun};
 
 /// Fine-tune a GRACE model on labelled structures
 ///
@@ -51,10 +48,11 @@ pub struct UpfitArgs {
     /// Passes over the training set
     #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
     epochs: u64,
-    /// Validate with the structures of this file, and train with all of DATA; may be repeated
+    /// Validate with the structures of this file, which is none of DATA, and train with all of DATA; may be repeated
     #[arg(long, value_name = "FILE", conflicts_with = "validation_share")]
     validation: Vec<PathBuf>,
-    /// Share of the structures of DATA for validation, whole seed structures only; 0: none, then the last weights are written
+    /// Share of the structures of DATA for validation, whole seed structures only and at least the smallest; 0: none, then the last
+    /// weights are written
     #[arg(long, value_name = "X", default_value_t = 0.1, value_parser = share)]
     validation_share: f64,
     /// Weights of the loss. demo: energy 20, forces 5, stress 20; paper: 1, 5 and 0.1, after 5/12 of the epochs 25, 1 and 0.1
@@ -103,7 +101,7 @@ pub struct UpfitArgs {
     /// File of the state [default: NEW.npz.upfit]
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
-    /// Also draw the learning curves
+    /// Also draw the learning curves: loss, mean absolute errors and learning rate by epoch
     #[arg(long, value_name = "FILE.svg")]
     figure: Option<PathBuf>,
     /// Print JSON
@@ -120,33 +118,13 @@ enum LossName {
 
 impl UpfitArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
-        let checkpoint = self.checkpoint_path();
-        self.check_outputs(&checkpoint)?;
-        let model = TrainableGrace::load(&self.model).map_err(CommandError::input)?;
-        let (data, files) = self.read_data()?;
-        let settings = self.settings();
-        let note = upfit_run::note((&self.model.display().to_string(), &model), &data, &files, &settings);
+        let request = self.request()?;
         let stop = stop_token()?;
-        let mut display = TrainingDisplay::new(&checkpoint);
-        let run = UpfitRun {
-            model,
-            data,
-            note: note.clone(),
-            settings,
-            output: self.output.clone(),
-            checkpoint: checkpoint.clone(),
-        };
-        let trained = run.run(
-            |event| {
-                display.show(&event);
-                if stop.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-            },
-            |outcome| self.draw(outcome),
-            command_error,
-        );
+        let mut display = TrainingDisplay::new(&request.checkpoint);
+        let trained = fine_tune(&request, &stop, |event| display.show(event));
         drop(display);
-        let Some(outcome) = trained? else {
-            print_stderr(format_args!("stopped; the same command continues from {}", checkpoint.display()));
+        let Some(FineTuned { outcome, note }) = trained? else {
+            print_stderr(stopped_text(&request.checkpoint));
             return Ok(ExitStatus::Interrupted);
         };
         if self.json {
@@ -157,13 +135,21 @@ impl UpfitArgs {
         Ok(ExitStatus::Done)
     }
 
-    /// Draws the learning curves, if asked for.
-    fn draw(&self, outcome: &UpfitOutcome) -> Result<(), CommandError> {
-        let Some(path) = &self.figure else { return Ok(()) };
-        let mut file = AtomicFile::create(path)?;
-        let text = to_svg(&figure::learning_curves(&outcome.history));
-        file.write_all(text.as_bytes()).map_err(|error| cannot_write(path, error))?;
-        file.finish()
+    /// What the arguments ask for.
+    fn request(&self) -> Result<FineTuning, CommandError> {
+        let mut data = self.reading.files(&self.data)?;
+        data.set_weights(&self.weight)?;
+        let is_named = !self.validation.is_empty();
+        Ok(FineTuning {
+            model: self.model.clone(),
+            data,
+            validation: is_named.then(|| self.reading.files(&self.validation)).transpose()?,
+            validation_share: self.validation_share,
+            settings: self.settings(),
+            output: self.output.clone(),
+            checkpoint: self.checkpoint_path(),
+            figure: self.figure.clone(),
+        })
     }
 
     fn checkpoint_path(&self) -> PathBuf {
@@ -172,48 +158,6 @@ impl UpfitArgs {
             name.push(".upfit");
             name.into()
         })
-    }
-
-    /// Finds errors in paths before hours of work.
-    fn check_outputs(&self, checkpoint: &Path) -> Result<(), CommandError> {
-        let outputs = || [self.output.as_path(), checkpoint].into_iter().chain(self.figure.as_deref());
-        let data = self.data.iter().map(|path| (path.as_path(), "a file of training data"));
-        let validation = self.validation.iter().map(|path| (path.as_path(), "a file of validation data"));
-        let inputs: Vec<_> =
-            std::iter::once((self.model.as_path(), "the model")).chain(data).chain(validation).collect();
-        for (number, output) in outputs().enumerate() {
-            refuse_to_replace(output, inputs.iter().copied())?;
-            if outputs().take(number).any(|other| other == output) {
-                return Err(CommandError::Input(format!("{}: named for two outputs", output.display())));
-            }
-            AtomicFile::create(output).map(drop)?;
-        }
-        Ok(())
-    }
-
-    /// Both sets, and the files that they come from.
-    fn read_data(&self) -> Result<(TrainingData, Vec<DataFile>), CommandError> {
-        let mut files = self.reading.files(&self.data)?;
-        files.set_weights(&self.weight)?;
-        let (frames, mut sources) = read_frames(&files, false)?;
-        let data = if self.validation.is_empty() {
-            ::upfit::split(frames, self.validation_share, self.rng_seed).map_err(command_error)?
-        } else {
-            let (validation, others) = read_frames(&self.reading.files(&self.validation)?, true)?;
-            sources.extend(others);
-            TrainingData { training: frames, validation }
-        };
-        if self.patience.is_some() && data.validation.is_empty() {
-            let message = "--patience: expected a validation set, not --validation-share 0";
-            return Err(CommandError::input(message));
-        }
-        let [training, validation] = [data.training.len(), data.validation.len()];
-        print_stderr(format_args!(
-            "{} to train with, {} for validation",
-            count(training as u64, "structure"),
-            count(validation as u64, "structure")
-        ));
-        Ok((data, sources))
     }
 
     fn settings(&self) -> UpfitSettings {
@@ -241,6 +185,13 @@ impl UpfitArgs {
             patience: self.patience,
             threads: self.threads.map_or(cores, usize::from),
         }
+    }
+}
+
+fn stopped_text(checkpoint: &Path) -> String {
+    match checkpoint.exists() {
+        true => format!("stopped; the same command continues from {}", checkpoint.display()),
+        false => "stopped before the first update; the same command begins again".to_owned(),
     }
 }
 

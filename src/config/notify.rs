@@ -44,11 +44,15 @@ pub enum NotifyEvent {
     Forgetting,
     /// Several walks in succession ended early.
     FailingWalks,
+    /// A version of the potential was registered.
+    Version,
+    /// A version of the potential was refused.
+    RefusedVersion,
 }
 
 impl NotifyEvent {
     /// All events.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 9] = [
         Self::End,
         Self::Failure,
         Self::Stall,
@@ -56,6 +60,8 @@ impl NotifyEvent {
         Self::FailedLabels,
         Self::Forgetting,
         Self::FailingWalks,
+        Self::Version,
+        Self::RefusedVersion,
     ];
 
     /// Name in the configuration.
@@ -68,6 +74,8 @@ impl NotifyEvent {
             Self::FailedLabels => "failed_labels",
             Self::Forgetting => "forgetting",
             Self::FailingWalks => "failing_walks",
+            Self::Version => "version",
+            Self::RefusedVersion => "refused_version",
         }
     }
 }

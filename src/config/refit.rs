@@ -27,7 +27,7 @@ pub struct RefitSection {
     /// Time since the last attempt after which a refit begins if there is anything new, in live mode. Default: none.
     #[serde(default)]
     pub after_time: Option<Duration>,
-    /// Number of versions to train. Refused ones do not count.
+    /// Number of versions to train; the campaign ends with the last one. Refused ones do not count.
     #[serde(default = "defaults::max_versions")]
     pub max_versions: NonZeroU32,
     /// Share of the seed structures whose labels are never trained on, from 0 up to, not including, 1.
@@ -190,6 +190,16 @@ impl RefitSection {
         match &mut self.method {
             RefitMethod::Command(command) => command.program.first_mut().filter(|name| name.contains('/')),
             RefitMethod::Native(_) => None,
+        }
+    }
+}
+
+impl RefitMethod {
+    /// The name of its key: `native` or `command`.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Native(_) => "native",
+            Self::Command(_) => "command",
         }
     }
 }

@@ -99,7 +99,7 @@ names! {
     /// Numeric properties.
     NumberField {
         Gamma "gamma", GammaNbr "gamma_nbr", RelativeVolume "relative_volume", Temperature "temperature",
-        KineticTemperature "kinetic_temperature", Tau "tau", Walk "walk", Step "step",
+        KineticTemperature "kinetic_temperature", Tau "tau", Version "version", Walk "walk", Step "step",
         MixtureVersion "mixture_version", Atoms "atoms", Energy "energy", EnergyPerAtom "energy_per_atom",
         MaxForce "max_force"
     }
@@ -175,6 +175,7 @@ impl StructureProperties<'_> {
             NumberField::Temperature => self.conditions.map(|conditions| conditions.temperature),
             NumberField::KineticTemperature => self.kinetic_temperature,
             NumberField::Tau => self.conditions.map(|conditions| conditions.tau),
+            NumberField::Version => self.conditions.map(|conditions| f64::from(conditions.version)),
             NumberField::Walk => self.walk.map(f64::from),
             NumberField::Step => self.step.map(|step| step as f64),
             NumberField::MixtureVersion => self.mixture_version.map(|version| version as f64),

@@ -62,6 +62,18 @@ fn has_word(text: &str, word: &str) -> bool {
 }
 
 #[test]
+fn versions_are_those_of_the_walk() {
+    let conditions = WalkConditions { version: 2, ..WalkConditions::default() };
+    let found = StructureProperties { conditions: Some(&conditions), ..properties() };
+    for (text, expected) in
+        [("version = 2", true), ("version < 2", false), ("version != 0 and gamma > 2", true)]
+    {
+        assert_eq!(text.parse::<StructureFilter>().unwrap().matches(&found), expected, "{text}");
+    }
+    assert!(!matches("version = 0"), "unknown");
+}
+
+#[test]
 fn help_and_docs_name_every_property() {
     use clap::CommandFactory;
     let mut command = crate::cli::Arguments::command();

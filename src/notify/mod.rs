@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 
+use monitor::versions::CampaignVersions;
 use monitor::walk_ends::WalkEnds;
 use serde::{Deserialize, Serialize};
 use store::CampaignStatus;
@@ -10,7 +11,7 @@ use store::CampaignStatus;
 use crate::config::{NotifyEvent, NotifySection};
 use crate::forgetting::{ForgettingMeasurement, ForgettingRule};
 use crate::output::count;
-use crate::wording::walk_ends;
+use crate::wording::{versions, walk_ends};
 
 const MINUTE: f64 = 60_000.0;
 /// Stored for the event `forgetting` while the alarm is raised.
@@ -93,6 +94,22 @@ impl NotificationTracker {
             }
             false => None,
         }
+    }
+
+    /// Returns an event for each version of the potential that was registered or refused since the last one.
+    pub fn check_versions(&mut self, found: &CampaignVersions) -> Vec<Notification> {
+        let mut due = Vec::new();
+        for version in found.all.iter().filter(|version| version.number > 0) {
+            let (event, message) = match version.is_registered() {
+                true => (NotifyEvent::Version, versions::registered(version)),
+                false => (NotifyEvent::RefusedVersion, versions::refused(version)),
+            };
+            let last = self.sent.0.get(event.name()).and_then(|number| number.parse().ok());
+            if version.number > last.unwrap_or(0) {
+                due.extend(self.due(event, version.number.to_string(), message));
+            }
+        }
+        due
     }
 
     /// Reports that a run cannot go on, every time.
@@ -212,6 +229,24 @@ mod tests {
             assert_eq!(due.len(), expected, "{:?}", status.walks);
             assert!(due.iter().all(|due| due.event == NotifyEvent::FailingWalks), "{due:?}");
         }
+    }
+
+    #[test]
+    fn every_version_is_reported_once() {
+        use NotifyEvent::{RefusedVersion, Version};
+        let (mut watch, mut found) = (watch(), versions::tests::example());
+        let all = found.all.split_off(2);
+        assert_eq!(
+            events(&watch.check_versions(&found)),
+            [Version],
+            "version 0 is that of the configuration"
+        );
+        found.all.extend(all);
+        let due = watch.check_versions(&found);
+        assert_eq!(events(&due), [RefusedVersion, Version]);
+        assert!(due[1].message.contains("version 3 of the potential is registered: trained on 120 labels"));
+        let mut next = NotificationTracker::new(NotifySection::default(), watch.sent().clone());
+        assert_eq!((watch.check_versions(&found), next.check_versions(&found)), (Vec::new(), Vec::new()));
     }
 
     #[test]

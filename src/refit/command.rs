@@ -1,16 +1,19 @@
 //! Training by a program of the user.
 
-use std::fs::File;
-use std::io::{Read, Seek, SeekFrom};
-use std::path::Path;
+use std::fs::{self, File};
+use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::os::unix::ffi::{OsStrExt, OsStringExt};
+use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;
 
-use tokio::process::Command;
+use tokio::process::{Child, Command};
 use tokio_util::sync::CancellationToken;
 use workers::labeller::{CALCULATION_MARK, terminate_marked};
 
+use super::failure::RefitFailure;
 use super::settings::RefitterConfig;
+use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::config::CommandRefit;
 use crate::exit_status::CommandError;
 
@@ -22,46 +25,38 @@ const LOG: &str = "command.log";
 const SHOWN: u64 = 600;
 /// The new model.
 pub const MODEL: &str = "model.npz";
+/// File with the mark of the processes of the last start.
+const MARK: &str = "command.mark";
+/// Option of `calmwalk refitter` with which it ends the processes with a mark when its standard input is closed.
+pub const END_MARKED: &str = "--end-marked";
 
 /// Runs the program in the directory of the refit, where it has to leave [`MODEL`]. `None` after a cancellation of `stop`.
 ///
 /// The program learns from its environment where its files are. It is ended, with all processes that it has started, when this process
-/// is asked to stop and when the time is over; those of a refit that was killed before the program is started again.
+/// is asked to stop or is killed, and when the time is over.
 ///
 /// # Errors
-/// A program that cannot be started, fails, takes too long, or leaves no model.
+/// Refused: a program that cannot be started, fails, takes too long, or leaves no model. Failed: an error of the system.
 pub async fn run(
     command: &CommandRefit,
     config: &RefitterConfig,
     directory: &Path,
-    (train, held_out): (&Path, Option<&Path>),
+    labels: (&Path, Option<&Path>),
     stop: &CancellationToken,
-) -> Result<Option<()>, CommandError> {
+) -> Result<Option<()>, RefitFailure> {
     let log = directory.join(LOG);
-    let failed = |problem: String| CommandError::Input(format!("{problem}{}", last_lines(&log)));
-    let Some((program, arguments)) = command.program.split_first() else {
-        return Err(CommandError::input("refit.method.command.program is empty"));
+    let failed = |problem: String| RefitFailure::Refused(format!("{problem}{}", last_lines(&log)));
+    let Some(program) = command.program.first() else {
+        return Err(RefitFailure::refused("refit.method.command.program is empty"));
     };
-    let output = File::create(&log).map_err(CommandError::failed)?;
-    let replay: Vec<_> = config.settings.replay.iter().map(|file| file.path.as_os_str()).collect();
-    let mut process = Command::new(program);
-    process
-        .args(arguments)
-        .current_dir(directory)
-        .stdin(Stdio::null())
-        .stdout(output.try_clone().map_err(CommandError::failed)?)
-        .stderr(output)
-        .env("CALMWALK_REFIT_DIRECTORY", directory)
-        .env("CALMWALK_PARENT_MODEL", &config.begin().path)
-        .env("CALMWALK_PARENT_MIXTURE", &config.parent_mixture.path)
-        .env("CALMWALK_TRAIN", train)
-        .env("CALMWALK_HELD_OUT", held_out.unwrap_or(Path::new("")))
-        .env("CALMWALK_REPLAY", replay.join(std::ffi::OsStr::new(":")))
-        .env("CALMWALK_RNG_SEED", config.rng_seed.to_string())
-        .env(CALCULATION_MARK, directory);
-    // A refit that was killed may have left them.
-    end_processes(directory).await?;
-    let child = process.process_group(0).kill_on_drop(true).spawn();
+    end_earlier(directory).await?;
+    let mark = directory.join(format!("command-{}", std::process::id()));
+    write_mark(directory, &mark)?;
+    // Its standard input is closed when this process is gone, however it ends.
+    let guard = start_guard(&mark).map_err(CommandError::failed)?;
+    let mut process = prepare(command, config, directory, labels, &log)?;
+    process.env(CALCULATION_MARK, &mark);
+    let child = process.spawn();
     let mut child = child.map_err(|error| failed(format!("{program}: cannot be started: {error}")))?;
     let limit = command.time_limit.map_or(NO_LIMIT, |limit| limit.get());
     let ended = tokio::select! {
@@ -69,7 +64,8 @@ pub async fn run(
         () = stop.cancelled() => None,
         () = tokio::time::sleep(limit) => None,
     };
-    end_processes(directory).await?;
+    end_processes(mark).await?;
+    drop(guard);
     let Some(status) = ended else {
         if stop.is_cancelled() {
             return Ok(None);
@@ -86,10 +82,77 @@ pub async fn run(
     Ok(Some(()))
 }
 
-/// Ends every process that the program of this directory has started.
-async fn end_processes(directory: &Path) -> Result<(), CommandError> {
-    let directory = directory.to_owned();
-    let ended = tokio::task::spawn_blocking(move || terminate_marked(&directory)).await;
+/// The program with its environment. A model that an earlier start left unfinished is removed.
+fn prepare(
+    command: &CommandRefit,
+    config: &RefitterConfig,
+    directory: &Path,
+    (train, held_out): (&Path, Option<&Path>),
+    log: &Path,
+) -> Result<Command, CommandError> {
+    let model = directory.join(MODEL);
+    match fs::remove_file(&model) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(cannot_write(&model, error)),
+        _ => {}
+    }
+    let output = File::create(log).map_err(|error| cannot_write(log, error))?;
+    let replay: Vec<_> = config.settings.replay.iter().map(|file| file.path.as_os_str()).collect();
+    let mut process = Command::new(command.program.first().map_or("", String::as_str));
+    process
+        .args(command.program.iter().skip(1))
+        .current_dir(directory)
+        .stdin(Stdio::null())
+        .stdout(output.try_clone().map_err(CommandError::failed)?)
+        .stderr(output)
+        .env("CALMWALK_REFIT_DIRECTORY", directory)
+        .env("CALMWALK_PARENT_MODEL", &config.begin().path)
+        .env("CALMWALK_PARENT_MIXTURE", &config.parent_mixture.path)
+        .env("CALMWALK_TRAIN", train)
+        .env("CALMWALK_HELD_OUT", held_out.unwrap_or(Path::new("")))
+        .env("CALMWALK_REPLAY", replay.join(std::ffi::OsStr::new(":")))
+        .env("CALMWALK_RNG_SEED", config.rng_seed.to_string())
+        .process_group(0)
+        .kill_on_drop(true);
+    Ok(process)
+}
+
+/// Ends what a refit that was killed has left of its program.
+async fn end_earlier(directory: &Path) -> Result<(), CommandError> {
+    let path = directory.join(MARK);
+    match fs::read(&path) {
+        Ok(mark) => end_processes(PathBuf::from(std::ffi::OsString::from_vec(mark))).await,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        Err(error) => Err(CommandError::Failed(format!("cannot read {}: {error}", path.display()))),
+    }
+}
+
+/// Another mark for each start: the guard of an earlier one may still be at work.
+fn write_mark(directory: &Path, mark: &Path) -> Result<(), CommandError> {
+    let path = directory.join(MARK);
+    let mut file = AtomicFile::create(&path)?;
+    file.write_all(mark.as_os_str().as_bytes()).map_err(|error| cannot_write(&path, error))?;
+    file.finish()
+}
+
+/// Starts a process that runs [`end_marked_when_alone`].
+fn start_guard(mark: &Path) -> io::Result<Child> {
+    let mut guard = Command::new("/proc/self/exe");
+    guard.arg0("calmwalk").args(["refitter", END_MARKED]).arg(mark).current_dir("/").process_group(0);
+    guard.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::null()).spawn()
+}
+
+/// Waits until standard input is closed, and ends every process with this mark.
+///
+/// # Errors
+/// A process that cannot be ended.
+pub fn end_marked_when_alone(mark: &Path) -> Result<(), CommandError> {
+    io::copy(&mut io::stdin().lock(), &mut io::sink()).map_err(CommandError::failed)?;
+    terminate_marked(mark).map_err(CommandError::failed)
+}
+
+/// Ends every process that the program with this mark has started.
+async fn end_processes(mark: PathBuf) -> Result<(), CommandError> {
+    let ended = tokio::task::spawn_blocking(move || terminate_marked(&mark)).await;
     ended.map_err(CommandError::failed)?.map_err(CommandError::failed)
 }
 

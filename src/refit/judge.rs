@@ -2,14 +2,17 @@
 
 use std::path::{Path, PathBuf};
 
-use potentials::grace::{GraceModel, Precision, RadialPath};
+use potentials::grace::{GraceError, GraceModel, Precision, RadialPath, Threads};
 use serde::{Deserialize, Serialize};
-use upfit::{LabelledFrame, SetErrors, errors_of};
+use tokio_util::sync::CancellationToken;
+use upfit::{LabelledFrame, SetErrors, UpfitError, errors_of, zero_of_labels};
 
+use super::failure::RefitFailure;
 use super::settings::{RefitSettings, RefitterConfig};
 use super::training_set::{LabelFile, LabelFiles};
 use crate::exit_status::CommandError;
 use crate::labelled_frames::{command_error, read_frames};
+use crate::process_config::HashedFile;
 use crate::structure_files::StructureReadingArgs;
 
 /// What a data set is for.
@@ -71,22 +74,45 @@ struct DataSet {
 }
 
 /// The data sets that versions are judged by.
-pub struct DataSets(Vec<DataSet>);
+pub struct DataSets {
+    /// None of them is empty.
+    sets: Vec<DataSet>,
+    /// The labels of the campaign that the version is trained on.
+    trained_on: Vec<LabelledFrame>,
+}
+
+/// What models are evaluated with.
+pub struct EvaluationContext<'a> {
+    /// The threads.
+    pub threads: Threads,
+    /// Ends an evaluation.
+    pub stop: &'a CancellationToken,
+}
 
 impl DataSets {
-    /// Reads the test sets, and what there is of held-out labels, replay data and later labels.
+    /// Reads the test sets, and what there is of held-out labels, replay data and later labels. `None` after a cancellation of `stop`.
     ///
     /// # Errors
-    /// A file that cannot be read, labels that are broken.
+    /// Refused: labels of the campaign that are broken. Failed: the same of files of the configuration.
     pub fn read(
         settings: &RefitSettings,
         directory: &Path,
         [frozen, since]: [&LabelFiles; 2],
-    ) -> Result<Self, CommandError> {
+        stop: &CancellationToken,
+    ) -> Result<Option<Self>, RefitFailure> {
+        let read = |paths: &[PathBuf]| -> Result<Vec<LabelledFrame>, CommandError> {
+            let found = read_frames(&StructureReadingArgs::default().files(paths)?, true, stop)?;
+            Ok(found.map(|(frames, _)| frames).unwrap_or_default())
+        };
         let mut sets = Vec::new();
-        let mut add = |name: &str, kind, paths: &[PathBuf]| -> Result<(), CommandError> {
-            let (frames, _) = read_frames(&StructureReadingArgs::default().files(paths)?, true)?;
-            sets.push(DataSet { name: name.to_owned(), kind, frames });
+        let mut add = |name: &str, kind, paths: &[PathBuf]| -> Result<(), RefitFailure> {
+            let frames = match kind {
+                SetKind::Test | SetKind::Seed => read(paths)?,
+                SetKind::HeldOut | SetKind::Since => read(paths).map_err(RefitFailure::of_input)?,
+            };
+            if !frames.is_empty() {
+                sets.push(DataSet { name: name.to_owned(), kind, frames });
+            }
             Ok(())
         };
         for set in &settings.test_sets {
@@ -100,71 +126,109 @@ impl DataSets {
         if let Some(path) = since.path(directory, LabelFile::Since) {
             add("since", SetKind::Since, &[path])?;
         }
-        Ok(Self(sets))
+        let training: Vec<_> = frozen.path(directory, LabelFile::Training).into_iter().collect();
+        let trained_on = read(&training).map_err(RefitFailure::of_input)?;
+        // What was read until a cancellation is not all.
+        Ok((!stop.is_cancelled()).then_some(Self { sets, trained_on }))
     }
 
-    /// The errors of the models of version 0, the parent and the new version.
+    /// The errors of the models of version 0, the parent and the new version. `None` after a cancellation.
     ///
     /// # Errors
-    /// A structure that a model cannot evaluate, errors that are not finite.
-    pub fn errors(&self, config: &RefitterConfig, version: &Path) -> Result<Vec<SetFigures>, CommandError> {
-        let load = |path: &Path| load(path, config.precision);
-        let [first, parent, version] =
-            [&*config.first_model.path, &*config.parent_model.path, version].map(load);
-        let (first, parent, version) = (first?, parent?, version?);
-        check_compatible(&parent, &version)?;
-        let threads = config.settings.threads();
-        let of_set = |set: &DataSet| -> Result<SetFigures, CommandError> {
-            let errors = |model| errors_of(model, &set.frames, threads).map_err(command_error);
-            Ok(SetFigures {
-                name: set.name.clone(),
-                kind: set.kind,
-                structures: set.frames.len() as u64,
-                first: errors(&first)?,
-                parent: errors(&parent)?,
-                version: errors(&version)?,
-            })
-        };
-        self.0.iter().map(of_set).collect()
-    }
-
-    /// The errors of another model.
-    ///
-    /// # Errors
-    /// A structure that it cannot evaluate, errors that are not finite.
-    pub fn errors_of_model(
+    /// Refused: a structure that the new model cannot evaluate, or with errors that are not finite. Failed: the same of the others.
+    pub fn errors(
         &self,
         config: &RefitterConfig,
-        model: &Path,
-    ) -> Result<Vec<ComparedSet>, CommandError> {
-        let model = load(model, config.precision)?;
-        let threads = config.settings.threads();
-        let of_set = |set: &DataSet| {
-            let errors = errors_of(&model, &set.frames, threads).map_err(command_error)?;
-            Ok(ComparedSet { name: set.name.clone(), errors })
+        version: &GraceModel,
+        evaluation: &EvaluationContext<'_>,
+    ) -> Result<Option<Vec<SetFigures>>, RefitFailure> {
+        let known = |file: &HashedFile| -> Result<Option<Vec<SetErrors>>, CommandError> {
+            let model = load(&file.path, config.precision).map_err(CommandError::input)?;
+            self.errors_of(&model, evaluation).map_err(command_error)
         };
-        self.0.iter().map(of_set).collect()
+        let RefitterConfig { first_model, parent_model, .. } = config;
+        let Some(of_first) = known(first_model)? else { return Ok(None) };
+        let of_parent = match first_model.hash == parent_model.hash {
+            true => Some(of_first.clone()),
+            false => known(parent_model)?,
+        };
+        let of_version = self.errors_of(version, evaluation).map_err(RefitFailure::of_training)?;
+        let (Some(of_parent), Some(of_version)) = (of_parent, of_version) else { return Ok(None) };
+        let errors = of_first.into_iter().zip(of_parent).zip(of_version);
+        let figures = self.sets.iter().zip(errors).map(|(set, ((first, parent), version))| SetFigures {
+            name: set.name.clone(),
+            kind: set.kind,
+            structures: set.frames.len() as u64,
+            first,
+            parent,
+            version,
+        });
+        Ok(Some(figures.collect()))
+    }
+
+    /// The errors of another model. `None` after a cancellation.
+    ///
+    /// # Errors
+    /// Refused: a model that cannot be read, a structure that it cannot evaluate, errors that are not finite.
+    pub fn errors_of_file(
+        &self,
+        precision: Precision,
+        model: &Path,
+        evaluation: &EvaluationContext<'_>,
+    ) -> Result<Option<Vec<ComparedSet>>, RefitFailure> {
+        let model = load(model, precision).map_err(RefitFailure::refused)?;
+        let found = self.errors_of(&model, evaluation).map_err(RefitFailure::of_training)?;
+        let named = |(set, errors): (&DataSet, SetErrors)| ComparedSet { name: set.name.clone(), errors };
+        Ok(found.map(|errors| self.sets.iter().zip(errors).map(named).collect()))
+    }
+
+    /// The errors of a model on each set. Its energies have the zero that a training with the same data gives them: labels of another
+    /// program say nothing about the zero of a model that was not trained on them.
+    fn errors_of(
+        &self,
+        model: &GraceModel,
+        EvaluationContext { threads, stop }: &EvaluationContext<'_>,
+    ) -> Result<Option<Vec<SetErrors>>, UpfitError> {
+        let is_stopped = || stop.is_cancelled();
+        let replay = self.sets.iter().filter(|set| set.kind == SetKind::Seed).map(|set| &set.frames[..]);
+        let trained_on: Vec<_> = replay.chain([&self.trained_on[..]]).collect();
+        let zero = zero_of_labels(model, &trained_on, threads, &is_stopped)?;
+        let Some(zero) = zero else { return Ok(None) };
+        let mut found = Vec::new();
+        for set in &self.sets {
+            let errors = errors_of(model, &set.frames, &zero, threads, &is_stopped)?;
+            let Some(errors) = errors else { return Ok(None) };
+            found.push(errors);
+        }
+        Ok(Some(found))
     }
 }
 
-fn load(path: &Path, precision: Precision) -> Result<GraceModel, CommandError> {
-    GraceModel::load_in(path, precision, RadialPath::default()).map_err(CommandError::input)
+fn load(path: &Path, precision: Precision) -> Result<GraceModel, GraceError> {
+    GraceModel::load_in(path, precision, RadialPath::default())
 }
 
-/// Walks of all versions have the same elements and limits on distances.
-fn check_compatible(parent: &GraceModel, version: &GraceModel) -> Result<(), CommandError> {
-    let n = parent.elements().len();
+/// Reads a new model. Walks of all versions have the same elements and cutoffs.
+///
+/// # Errors
+/// Refused: a file that is no model, a model with others. Failed: the parent's file.
+pub fn load_version(config: &RefitterConfig, path: &Path) -> Result<GraceModel, RefitFailure> {
+    let unreadable =
+        |error: GraceError| RefitFailure::Refused(format!("the new model cannot be read: {error}"));
+    let version = load(path, config.precision).map_err(unreadable)?;
+    let parent = load(&config.parent_model.path, config.precision).map_err(CommandError::input)?;
     let wrong = |what: &str| {
-        Err(CommandError::Input(format!("the new model has other {what} than that of its parent")))
+        Err(RefitFailure::Refused(format!("the new model has other {what} than that of its parent")))
     };
     if parent.elements() != version.elements() {
         return wrong("elements");
     }
+    let n = parent.elements().len();
     let differ = |k: &usize| parent.pair_cutoff(k / n, k % n) != version.pair_cutoff(k / n, k % n);
     if (0..n * n).any(|k| differ(&k)) {
         return wrong("cutoffs");
     }
-    Ok(())
+    Ok(version)
 }
 
 /// Why a version with these errors is refused, if it is.

@@ -10,6 +10,7 @@ use potentials::grace::GraceModel;
 use store::Store;
 use tokio_util::sync::CancellationToken;
 
+use super::failure::RefitFailure;
 use super::native::files;
 use super::settings::RefitterConfig;
 use crate::artifact_checks::check_sound;
@@ -31,14 +32,14 @@ const MAX_FEATURE_BYTES: u64 = 4_000_000_000;
 /// candidates that are not among them. `None` after a cancellation of `stop`.
 ///
 /// # Errors
-/// Data that no sound mixture comes from, a full disk, the database.
+/// Refused: data that no sound mixture comes from. Failed: a full disk, the database.
 pub async fn build(
     config: &RefitterConfig,
     store: &Store,
     (model_file, labels, output): (&Path, &Path, &Path),
     trained_on: &HashSet<i64>,
     stop: &CancellationToken,
-) -> Result<Option<()>, CommandError> {
+) -> Result<Option<()>, RefitFailure> {
     let (found, projection, seed) = model(config, model_file)?;
     let settings = BuildSettings {
         dimension: projection.feature_dimension,
@@ -63,12 +64,13 @@ pub async fn build(
     let beside = output.to_owned();
     let work = tokio::task::spawn_blocking(move || {
         let mut build = MixtureBuild::open(context, settings, hash, &projection, &beside, false)?;
-        Ok::<_, CommandError>(build.run(projection, seed)?.map(|built| (build, built)))
+        let built = build.run(projection, seed).map_err(RefitFailure::of_input)?;
+        Ok::<_, RefitFailure>(built.map(|built| (build, built)))
     });
     let Some((build, built)) = work.await.map_err(CommandError::failed)?? else { return Ok(None) };
     let artifact = write_beside(&built, output)?;
     let original = Artifact::load(&artifact).map_err(CommandError::failed)?;
-    check_sound(&original, output).map_err(CommandError::Input)?;
+    check_sound(&original, output).map_err(RefitFailure::Refused)?;
     let updated =
         unlabelled_updates::apply_others(store, &found, original.mixture.clone(), trained_on, stop).await?;
     let Some(updated) = updated else { return Ok(None) };
@@ -81,16 +83,20 @@ pub async fn build(
 }
 
 /// The model with a projection of its features: its own, or that of its parent's artifact.
+///
+/// # Errors
+/// Refused: a model whose features do not fit the projection. Failed: the parent's artifact.
 fn model(
     config: &RefitterConfig,
     path: &Path,
-) -> Result<(Arc<GraceModel>, Projection, Option<i64>), CommandError> {
-    let mut model = GraceModel::load(path).map_err(CommandError::input)?;
-    if model.projection().is_none() {
+) -> Result<(Arc<GraceModel>, Projection, Option<i64>), RefitFailure> {
+    let mut model = GraceModel::load(path).map_err(RefitFailure::refused)?;
+    let is_its_own = model.projection().is_some();
+    if !is_its_own {
         let projection = Projection::load(&config.parent_mixture.path).map_err(CommandError::input)?;
-        model = with_projection(model, &projection).map_err(CommandError::input)?;
-        let (found, projection, _) = projected(path, model, None, config.rng_seed, PROJECTED)?;
-        return Ok((found, projection, None));
+        model = with_projection(model, &projection).map_err(RefitFailure::refused)?;
     }
-    projected(path, model, None, config.rng_seed, PROJECTED)
+    let found = projected(path, model, None, config.rng_seed, PROJECTED);
+    let (found, projection, seed) = found.map_err(RefitFailure::of_input)?;
+    Ok((found, projection, seed.filter(|_| is_its_own)))
 }

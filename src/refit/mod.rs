@@ -6,6 +6,7 @@
 
 mod command;
 mod cost;
+mod failure;
 mod judge;
 mod mixture;
 mod native;
@@ -19,13 +20,16 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use atoms::extxyz::write_frame;
+use potentials::grace::{GraceModel, Threads};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use store::{Store, VersionFiles, VersionRecord, VersionState, unix_milliseconds};
 use tokio_util::sync::CancellationToken;
 
+pub use self::command::end_marked_when_alone;
 use self::cost::CostMeter;
-use self::judge::{ComparisonFigures, DataSets, SetFigures, refusal};
+use self::failure::RefitFailure;
+use self::judge::{ComparisonFigures, DataSets, EvaluationContext, SetFigures, load_version, refusal};
 use self::native::NativeTraining;
 use self::settings::{RefitterConfig, TestSet};
 use self::training_set::{FrozenSet, LabelFile, LabelFiles, kept};
@@ -33,6 +37,7 @@ use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::config::{ControlFrames, NativeRefit, RefitMethod};
 use crate::exit_status::CommandError;
 use crate::file_hash::{hash, verify_hash};
+use crate::output::log_and_warn;
 use crate::structure_files::StructureReadingArgs;
 
 /// Folder of the campaign's directory for refits.
@@ -85,12 +90,17 @@ async fn run(
     report: &(dyn Fn(String) + Sync),
 ) -> Result<RefitOutcome, CommandError> {
     check_files(config)?;
-    let number = 1 + store.versions().await?.last().map_or(0, |version| version.number);
+    let versions = store.versions().await?;
+    if let Some(ended) = recorded_before(config, store, &versions).await? {
+        return Ok(ended);
+    }
+    let number = 1 + versions.last().map_or(0, |version| version.number);
     let directory = prepare_directory(&config.directory, number)?;
     let meter = CostMeter::new(&directory);
-    let set = kept(directory.join("set.json"), async || {
-        let last_decision = store.newest_mixture().await?.decision;
+    let set = kept::<_, CommandError>(directory.join("set.json"), async || {
+        // In this order: a structure that is accepted in between counts for the next refit.
         let accepted = store.accepted_structures().await?;
+        let last_decision = store.newest_mixture().await?.decision;
         Ok(Some(FrozenSet { number, last_decision, accepted }))
     });
     let Some(set) = set.await? else { return Ok(RefitOutcome::Stopped) };
@@ -99,18 +109,47 @@ async fn run(
         training_set::write(store, (&directory, &set), settings, false, stop).await
     });
     let Some(labels) = labels.await? else { return Ok(RefitOutcome::Stopped) };
-    let report_numbered = |line: String| report(format!("refit {number}: {line}"));
+    let report_numbered = |line: String| {
+        // So that a process that is killed leaves what it has cost.
+        if let Err(error) = meter.save() {
+            log_and_warn(format_args!("refit {number}: {error}"));
+        }
+        report(format!("refit {number}: {line}"));
+    };
     let refit = Refit { config, store, directory, set, labels, stop, report: &report_numbered };
-    let judged = refit.train_and_judge(&meter).await;
+    let judged = refit.train_and_judge().await;
     meter.save()?;
     let (reason, figures) = match judged {
         Ok(None) => return Ok(RefitOutcome::Stopped),
         Ok(Some(judged)) => judged,
-        // What cannot become a version.
-        Err(CommandError::Input(reason)) => (Some(reason), Value::Null),
-        Err(error) => return Err(error),
+        Err(RefitFailure::Refused(reason)) => (Some(reason), Value::Null),
+        Err(RefitFailure::Failed(error)) => return Err(error),
     };
     refit.record(reason, figures, &meter).await
+}
+
+/// How this refit ended, if an earlier process of it recorded that and was killed then.
+///
+/// A registered version that is newer than the parent was made since this refit was configured. The parent of a refused one remains;
+/// its directory is left, and nothing was accepted since.
+async fn recorded_before(
+    config: &RefitterConfig,
+    store: &Store,
+    versions: &[VersionRecord],
+) -> Result<Option<RefitOutcome>, CommandError> {
+    let Some(last) = versions.last() else { return Ok(None) };
+    let directory = config.directory.join(FOLDER).join(last.number.to_string());
+    let ended = if last.state == VersionState::Registered {
+        (last.number > config.parent_version).then(|| RefitOutcome::Registered(last.clone()))
+    } else if directory.exists() && store.accepted_structures().await? == last.structures {
+        Some(RefitOutcome::Refused(last.clone()))
+    } else {
+        None
+    };
+    if ended.is_some() {
+        let _ = fs::remove_dir_all(&directory);
+    }
+    Ok(ended)
 }
 
 /// Fails if a file has another content than when the campaign began, or this refit.
@@ -137,47 +176,76 @@ fn prepare_directory(campaign: &Path, number: u32) -> Result<PathBuf, CommandErr
 }
 
 impl Refit<'_> {
-    /// Takes all steps until the version can be recorded: why it is refused, if it is, and its figures. `None` if it was stopped.
-    ///
-    /// # Errors
-    /// Wrong input is a reason to refuse the version.
-    async fn train_and_judge(
-        &self,
-        meter: &CostMeter,
-    ) -> Result<Option<(Option<String>, Value)>, CommandError> {
+    /// Takes all steps until the version can be recorded: why it is refused, if it is, and its figures. `None` if it was stopped. A
+    /// version that is refused gets no mixture.
+    async fn train_and_judge(&self) -> Result<Option<(Option<String>, Value)>, RefitFailure> {
         let Some(labels) = self.labels.path(&self.directory, LabelFile::Training) else {
-            return Err(CommandError::input("there are no labels to train on"));
+            return Err(RefitFailure::refused("there are no labels to train on"));
         };
         let training = kept(self.directory.join("training.json"), || self.train(&labels));
         let Some(training) = training.await? else { return Ok(None) };
-        meter.save()?;
-        if !self.build_mixture(&labels).await? {
-            return Ok(None);
+        let version = load_version(self.config, &self.path(MODEL))?;
+        let Some(sets) = self.data_sets().await? else { return Ok(None) };
+        let Some(figures) = self.judge(&sets, &version).await? else { return Ok(None) };
+        let mut reason = refusal(&self.config.settings, &figures);
+        if reason.is_none() {
+            match self.build_mixture(&labels).await {
+                Ok(true) => {}
+                Ok(false) => return Ok(None),
+                Err(RefitFailure::Refused(of_mixture)) => reason = Some(of_mixture),
+                Err(failed) => return Err(failed),
+            }
         }
-        meter.save()?;
+        let Some(comparisons) = self.compare_all(&sets).await? else { return Ok(None) };
+        let figures = json!({ "sets": figures, "comparisons": comparisons, "training": training });
+        Ok(Some((reason, figures)))
+    }
+
+    /// The data sets to judge with. `None` if it was stopped.
+    async fn data_sets(&self) -> Result<Option<DataSets>, RefitFailure> {
         let since = kept(self.directory.join("since.json"), async || {
             let settings = (&self.config.settings, self.config.rng_seed);
             training_set::write(self.store, (&self.directory, &self.set), settings, true, self.stop).await
         });
         let Some(since) = since.await? else { return Ok(None) };
-        (self.report)("judging".to_owned());
-        let sets = DataSets::read(&self.config.settings, &self.directory, [&self.labels, &since])?;
-        let figures = kept(self.directory.join("errors.json"), async || {
-            let errors = tokio::task::block_in_place(|| sets.errors(self.config, &self.path(MODEL)))?;
-            Ok(Some(errors))
-        });
-        let Some(figures): Option<Vec<SetFigures>> = figures.await? else { return Ok(None) };
-        let reason = refusal(&self.config.settings, &figures);
+        DataSets::read(&self.config.settings, &self.directory, [&self.labels, &since], self.stop)
+    }
+
+    /// The errors of the version and of those before it. `None` if it was stopped.
+    async fn judge(
+        &self,
+        sets: &DataSets,
+        version: &GraceModel,
+    ) -> Result<Option<Vec<SetFigures>>, RefitFailure> {
+        kept(self.directory.join("errors.json"), async || {
+            (self.report)("judging".to_owned());
+            let evaluation = self.evaluation()?;
+            tokio::task::block_in_place(|| sets.errors(self.config, version, &evaluation))
+        })
+        .await
+    }
+
+    fn evaluation(&self) -> Result<EvaluationContext<'_>, CommandError> {
+        let threads = Threads::new(self.config.settings.threads()).map_err(CommandError::failed)?;
+        Ok(EvaluationContext { threads, stop: self.stop })
+    }
+
+    /// The errors of the models that are trained for comparison; one that cannot be trained is left out. `None` if it was stopped.
+    async fn compare_all(&self, sets: &DataSets) -> Result<Option<Vec<ComparisonFigures>>, RefitFailure> {
+        let RefitMethod::Native(native) = &self.config.settings.method else { return Ok(Some(Vec::new())) };
         let mut comparisons = Vec::new();
-        if let RefitMethod::Native(native) = &self.config.settings.method {
-            for (name, file) in self.comparisons()? {
-                let Some(found) = self.compare(native, &sets, &name, &file).await? else { return Ok(None) };
-                comparisons.push(found);
-                meter.save()?;
+        for (name, file) in self.comparisons()? {
+            match self.compare(native, sets, &name, &file).await {
+                Ok(Some(found)) => comparisons.push(found),
+                Ok(None) => return Ok(None),
+                Err(RefitFailure::Refused(reason)) => {
+                    let number = self.set.number;
+                    log_and_warn(format_args!("refit {number}: no comparison with {name}: {reason}"));
+                }
+                Err(failed) => return Err(failed),
             }
         }
-        let figures = json!({ "sets": figures, "comparisons": comparisons, "training": training });
-        Ok(Some((reason, figures)))
+        Ok(Some(comparisons))
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -185,7 +253,7 @@ impl Refit<'_> {
     }
 
     /// Trains the model.
-    async fn train(&self, labels: &Path) -> Result<Option<TrainingRecord>, CommandError> {
+    async fn train(&self, labels: &Path) -> Result<Option<TrainingRecord>, RefitFailure> {
         match &self.config.settings.method {
             RefitMethod::Native(native) => self.train_natively(native, "training", labels, self.path(MODEL)),
             RefitMethod::Command(command) => {
@@ -204,7 +272,7 @@ impl Refit<'_> {
         what: &str,
         labels: &Path,
         output: PathBuf,
-    ) -> Result<Option<TrainingRecord>, CommandError> {
+    ) -> Result<Option<TrainingRecord>, RefitFailure> {
         let begin = (self.config.begin(), format!("version {}", self.config.begin_version()));
         let training = NativeTraining { begin, labels, output };
         let settings = (&self.config.settings, native);
@@ -219,7 +287,7 @@ impl Refit<'_> {
     }
 
     /// Builds the mixture. Returns whether it is there.
-    async fn build_mixture(&self, labels: &Path) -> Result<bool, CommandError> {
+    async fn build_mixture(&self, labels: &Path) -> Result<bool, RefitFailure> {
         let output = self.path(MIXTURE);
         if output.exists() {
             return Ok(true);
@@ -269,13 +337,16 @@ impl Refit<'_> {
         sets: &DataSets,
         name: &str,
         labels: &Path,
-    ) -> Result<Option<ComparisonFigures>, CommandError> {
+    ) -> Result<Option<ComparisonFigures>, RefitFailure> {
         kept(self.path(&format!("comparison-{name}.json")), async || {
             let model = self.path(&format!("comparison-{name}.npz"));
             let what = format!("comparison with {name}");
             let Some(_) = self.train_natively(native, &what, labels, model.clone())? else { return Ok(None) };
             let structures = count_frames(labels)?;
-            let sets = tokio::task::block_in_place(|| sets.errors_of_model(self.config, &model))?;
+            let precision = self.config.precision;
+            let evaluation = self.evaluation()?;
+            let errors = || sets.errors_of_file(precision, &model, &evaluation);
+            let Some(sets) = tokio::task::block_in_place(errors)? else { return Ok(None) };
             Ok(Some(ComparisonFigures { name: name.to_owned(), structures, sets }))
         })
         .await
@@ -294,17 +365,13 @@ impl Refit<'_> {
             true => Ok(String::new()),
             false => hash(&self.path(name)).map_err(CommandError::failed),
         };
-        let method = match &self.config.settings.method {
-            RefitMethod::Native(_) => "native",
-            RefitMethod::Command(_) => "command",
-        };
         let cost = meter.now();
         let record = VersionRecord {
             number: self.set.number,
-            parent: self.config.begin_version(),
+            parent: self.config.parent_version,
             state: if is_refused { VersionState::Refused } else { VersionState::Registered },
             reason: reason.unwrap_or_default(),
-            method: method.to_owned(),
+            method: self.config.settings.method.name().to_owned(),
             structures: self.set.accepted,
             last_decision: self.set.last_decision,
             labels: self.labels.count(LabelFile::Training),

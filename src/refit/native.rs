@@ -1,16 +1,16 @@
 //! Training by calmwalk itself.
 
-use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use potentials::grace::TrainableGrace;
 use tokio_util::sync::CancellationToken;
-use upfit::{CosineDecay, LossSettings, TrainingEvent, UpfitError, UpfitSettings};
+use upfit::{CosineDecay, LossSettings, TrainingEvent, UpfitSettings};
 
+use super::failure::RefitFailure;
 use super::settings::RefitSettings;
 use crate::config::{NativeRefit, RefitLoss};
 use crate::exit_status::CommandError;
-use crate::labelled_frames::{DataFile, command_error, read_frames};
+use crate::labelled_frames::{DataFile, read_frames};
 use crate::process_config::HashedFile;
 use crate::structure_files::{StructureFiles, StructureReadingArgs};
 use crate::upfit_run::{self, UpfitRun};
@@ -40,19 +40,21 @@ impl NativeTraining<'_> {
     /// Trains, or continues. `None` after a cancellation of `stop`.
     ///
     /// # Errors
-    /// Labels that nothing can be trained on, a loss that is not finite, a full disk.
+    /// Refused: a model that cannot be trained, labels that nothing can be trained on, a loss that is not finite. Failed: a full disk.
     pub fn run(
         self,
         (settings, native): (&RefitSettings, &NativeRefit),
         rng_seed: u64,
         stop: &CancellationToken,
         report: &dyn Fn(String),
-    ) -> Result<Option<TrainingSummary>, CommandError> {
+    ) -> Result<Option<TrainingSummary>, RefitFailure> {
         let (begin, name) = self.begin;
-        let model = TrainableGrace::load(&begin.path).map_err(CommandError::input)?;
+        let model = TrainableGrace::load(&begin.path).map_err(RefitFailure::refused)?;
         let files = files(settings, self.labels)?;
-        let (frames, sources) = read_frames(&files, false)?;
-        let data = upfit::split(frames, native.validation_share, rng_seed).map_err(command_error)?;
+        let read = read_frames(&files, false, stop).map_err(RefitFailure::of_input)?;
+        let Some((frames, sources)) = read else { return Ok(None) };
+        let data = upfit::split(frames, native.validation_share, rng_seed);
+        let data = data.map_err(RefitFailure::of_training)?;
         let upfit_settings = upfit_settings(native, rng_seed, settings.threads());
         // Without directories, so that the model has the same bytes wherever the campaign is.
         let sources: Vec<_> = sources.into_iter().map(DataFile::without_directory).collect();
@@ -62,8 +64,9 @@ impl NativeTraining<'_> {
         let epochs = upfit_settings.epochs;
         let run = UpfitRun { model, data, note, settings: upfit_settings, output: self.output, checkpoint };
         let outcome = run.run(
+            stop,
             |event| {
-                if let TrainingEvent::Epoch(record) = event {
+                if let TrainingEvent::Epoch { record, .. } = event {
                     let errors = record.errors.validation.as_ref().unwrap_or(&record.errors.training);
                     report(format!(
                         "epoch {} of {epochs}, force MAE {:.1} meV/Å, energy MAE {:.2} meV/atom",
@@ -72,10 +75,9 @@ impl NativeTraining<'_> {
                         1e3 * errors.energy_mae
                     ));
                 }
-                if stop.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
             },
             |_| Ok(()),
-            training_error,
+            RefitFailure::of_training,
         )?;
         Ok(outcome.map(|outcome| TrainingSummary {
             structures,
@@ -93,14 +95,6 @@ pub fn files(settings: &RefitSettings, labels: &Path) -> Result<StructureFiles, 
     let weights: Vec<_> = replay.into_iter().map(|path| (path, settings.replay_weight)).collect();
     files.set_weights(&weights)?;
     Ok(files)
-}
-
-/// A training that cannot give a model is wrong input, for which the version is refused; others can be repeated.
-fn training_error(error: UpfitError) -> CommandError {
-    match error {
-        UpfitError::NotFinite { .. } => CommandError::input(error),
-        error => command_error(error),
-    }
 }
 
 fn upfit_settings(native: &NativeRefit, seed: u64, threads: usize) -> UpfitSettings {

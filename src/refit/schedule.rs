@@ -5,7 +5,7 @@ use monitor::improvement::{Improvement, trained_versions};
 use orchestrator::selector::VERSION;
 use store::{Store, StoreError, VersionRecord, VersionState};
 
-use crate::config::{RefitSection, StopSection};
+use crate::config::{Config, RefitSection};
 
 /// What the times of refits follow from.
 #[derive(Clone, Debug, Default)]
@@ -16,20 +16,23 @@ pub struct RefitSchedule {
     pub accepted: u64,
     /// Number of the version that the decision log has taken up.
     pub taken_up: u32,
-    /// See [`StopSection::min_improvement`].
+    /// See [`StopSection::min_improvement`](crate::config::StopSection::min_improvement).
     pub min_improvement: Option<f64>,
+    /// See [`RefitSection::max_versions`]; 0 without a refit.
+    pub max_versions: usize,
 }
 
 impl RefitSchedule {
     /// Reads it from the campaign's database.
-    pub async fn read(store: &Store, stop: &StopSection) -> Result<Self, StoreError> {
+    pub async fn read(store: &Store, config: &Config) -> Result<Self, StoreError> {
         let values = store.values().await?;
         let taken_up = values.iter().find(|(name, _)| name == VERSION);
         Ok(Self {
             versions: store.versions().await?,
             accepted: store.accepted_structures().await?,
             taken_up: taken_up.and_then(|(_, number)| number.parse().ok()).unwrap_or(0),
-            min_improvement: stop.min_improvement.map(Positive::get),
+            min_improvement: config.stop.min_improvement.map(Positive::get),
+            max_versions: config.refit.as_ref().map_or(0, |refit| refit.max_versions.get() as usize),
         })
     }
 
@@ -57,9 +60,17 @@ impl RefitSchedule {
         self.min_improvement.is_some_and(below)
     }
 
-    /// Whether the campaign ends with the newest version, whose walks did not begin before that was known.
+    /// Whether as many versions are trained as there may be. Rollbacks do not count.
+    fn are_all_trained(&self) -> bool {
+        trained_versions(&self.versions).count() >= self.max_versions
+    }
+
+    /// Whether the campaign ends with the newest version: no walk starts with it, unless some have before that was known.
     pub fn is_newest_without_walks(&self) -> bool {
-        self.is_converged() && self.newest().is_some_and(|newest| newest.number > self.taken_up)
+        let is_last = |newest: &VersionRecord| {
+            newest.method != VersionRecord::ROLLBACK && (self.is_converged() || self.are_all_trained())
+        };
+        self.newest().is_some_and(|newest| newest.number > self.taken_up && is_last(newest))
     }
 
     /// Number of accepted structures at the last attempt.
@@ -67,10 +78,9 @@ impl RefitSchedule {
         self.versions.iter().map(|version| version.structures).max().unwrap_or(0)
     }
 
-    /// Whether the campaign trains further versions. Rollbacks do not count.
-    fn trains_more(&self, refit: &RefitSection) -> bool {
-        let trained = trained_versions(&self.versions).count();
-        !self.is_converged() && trained < refit.max_versions.get() as usize
+    /// Whether the campaign trains further versions.
+    fn trains_more(&self) -> bool {
+        !self.is_converged() && !self.are_all_trained()
     }
 
     /// Number of accepted structures at which biased walks make room for the next version. Those that made room for the last one
@@ -79,13 +89,13 @@ impl RefitSchedule {
         if self.is_newest_without_walks() {
             return Some(0);
         }
-        let after = refit.after_structures.filter(|_| self.trains_more(refit))?;
+        let after = refit.after_structures.filter(|_| self.trains_more())?;
         Some(self.accepted_before() + u64::from(after.get()))
     }
 
     /// Whether a refit is due when all walks have ended: there is anything new.
-    pub fn is_due_after_walks(&self, refit: &RefitSection) -> bool {
-        self.trains_more(refit) && self.has_news()
+    pub fn is_due_after_walks(&self) -> bool {
+        self.trains_more() && self.has_news()
     }
 
     /// Whether structures were accepted since the last attempt.
@@ -98,7 +108,7 @@ impl RefitSchedule {
         let last = self.versions.iter().map(|version| version.time).max().unwrap_or(begin);
         let by_time = refit.after_time.is_some_and(|time| now - last >= (1000.0 * time.seconds()) as i64);
         let by_structures = self.refit_at(refit).is_some_and(|number| self.accepted >= number);
-        self.is_due_after_walks(refit) && (by_time || by_structures)
+        self.is_due_after_walks() && (by_time || by_structures)
     }
 }
 
@@ -134,27 +144,28 @@ mod tests {
     #[test]
     fn refits_count_structures_from_the_last_attempt() {
         let refit = section("after_structures = 5\nmax_versions = 2");
-        let mut schedule = RefitSchedule { accepted: 4, ..RefitSchedule::default() };
+        let mut schedule =
+            RefitSchedule { accepted: 4, max_versions: 2, taken_up: 9, ..RefitSchedule::default() };
         assert_eq!((schedule.refit_at(&refit), schedule.in_force()), (Some(5), None));
-        assert!(schedule.is_due_after_walks(&refit) && !schedule.is_due_beside_walks(&refit, 0, 9));
+        assert!(schedule.is_due_after_walks() && !schedule.is_due_beside_walks(&refit, 0, 9));
         schedule.versions.push(version(1, VersionState::Registered, 4));
         assert_eq!(schedule.refit_at(&refit), Some(9));
-        assert!(!schedule.is_due_after_walks(&refit), "nothing is new");
+        assert!(!schedule.is_due_after_walks(), "nothing is new");
         // A refused attempt counts as one, but not as a version.
         schedule.accepted = 9;
         assert!(schedule.is_due_beside_walks(&refit, 0, 9));
         schedule.versions.push(version(2, VersionState::Refused, 9));
         assert_eq!((schedule.refit_at(&refit), schedule.in_force().unwrap().number), (Some(14), 1));
-        assert!(!schedule.is_due_after_walks(&refit));
+        assert!(!schedule.is_due_after_walks());
         schedule.accepted = 20;
         let rollback = VersionRecord {
             method: VersionRecord::ROLLBACK.into(),
             ..version(3, VersionState::Registered, 9)
         };
         schedule.versions.push(rollback);
-        assert!(schedule.is_due_after_walks(&refit), "a rollback is no training");
+        assert!(schedule.is_due_after_walks(), "a rollback is no training");
         schedule.versions.push(version(4, VersionState::Registered, 14));
-        assert_eq!((schedule.refit_at(&refit), schedule.is_due_after_walks(&refit)), (None, false));
+        assert_eq!((schedule.refit_at(&refit), schedule.is_due_after_walks()), (None, false));
     }
 
     #[test]
@@ -176,30 +187,58 @@ mod tests {
             accepted: 20,
             taken_up: 1,
             min_improvement: Some(0.15),
+            max_versions: 9,
         };
         let in_force = |schedule: &RefitSchedule| schedule.in_force().map_or(0, |version| version.number);
-        assert!(!schedule.is_converged() && schedule.is_due_after_walks(&refit));
+        assert!(!schedule.is_converged() && schedule.is_due_after_walks());
         assert_eq!((in_force(&schedule), schedule.refit_at(&refit)), (2, Some(7)));
         schedule.min_improvement = Some(0.25);
         assert!(schedule.is_converged() && schedule.is_newest_without_walks());
-        assert!(!schedule.is_due_after_walks(&refit) && !schedule.is_due_beside_walks(&refit, 0, i64::MAX));
+        assert!(!schedule.is_due_after_walks() && !schedule.is_due_beside_walks(&refit, 0, i64::MAX));
         assert_eq!((in_force(&schedule), schedule.refit_at(&refit)), (1, Some(0)));
         // Walks that have begun with it run to their end.
         schedule.taken_up = 2;
-        assert!(!schedule.is_newest_without_walks() && !schedule.is_due_after_walks(&refit));
+        assert!(!schedule.is_newest_without_walks() && !schedule.is_due_after_walks());
         assert_eq!((in_force(&schedule), schedule.refit_at(&refit)), (2, None));
         schedule.min_improvement = None;
-        assert!(schedule.is_due_after_walks(&refit));
+        assert!(schedule.is_due_after_walks());
         // The first version is the last one.
         schedule.versions.pop();
         (schedule.taken_up, schedule.min_improvement) = (0, Some(0.5));
         assert_eq!((in_force(&schedule), schedule.refit_at(&refit)), (0, Some(0)));
     }
 
+    /// The labels of the last walks are trained on, and no walk is run for nothing.
+    #[test]
+    fn the_campaign_ends_with_its_last_version() {
+        let refit = section("after_structures = 5");
+        let mut schedule = RefitSchedule {
+            versions: vec![version(1, VersionState::Registered, 5)],
+            accepted: 9,
+            taken_up: 1,
+            max_versions: 2,
+            ..RefitSchedule::default()
+        };
+        assert!(schedule.is_due_after_walks() && !schedule.is_newest_without_walks());
+        schedule.versions.push(version(2, VersionState::Registered, 9));
+        assert!(!schedule.is_due_after_walks() && schedule.is_newest_without_walks());
+        assert_eq!((schedule.in_force().unwrap().number, schedule.refit_at(&refit)), (1, Some(0)));
+        // With a larger limit it goes on with that version.
+        schedule.max_versions = 3;
+        assert!(!schedule.is_due_after_walks() && !schedule.is_newest_without_walks());
+        assert_eq!((schedule.in_force().unwrap().number, schedule.refit_at(&refit)), (2, Some(14)));
+        // Walks of a version that the user rolls back to are wanted.
+        let method = VersionRecord::ROLLBACK.into();
+        schedule.versions.push(VersionRecord { method, ..version(3, VersionState::Registered, 9) });
+        schedule.max_versions = 2;
+        assert!(!schedule.is_newest_without_walks());
+        assert_eq!(schedule.in_force().unwrap().number, 3);
+    }
+
     #[test]
     fn time_counts_from_the_last_attempt_or_the_begin_of_the_campaign() {
         let refit = section("after_time = \"20s\"");
-        let mut schedule = RefitSchedule { accepted: 3, ..RefitSchedule::default() };
+        let mut schedule = RefitSchedule { accepted: 3, max_versions: 2, ..RefitSchedule::default() };
         assert!(!schedule.is_due_beside_walks(&refit, 5_000, 24_999));
         assert!(schedule.is_due_beside_walks(&refit, 5_000, 25_000));
         schedule.versions.push(version(1, VersionState::Refused, 2));

@@ -1,6 +1,7 @@
 //! The labels of a campaign as files: to train on, to judge with, and to compare with.
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -150,10 +151,10 @@ pub async fn write(
         for row in page {
             let Some(kind) = sorter.file(&row, after) else { continue };
             let path = directory.join(kind.name());
-            if !files.contains_key(&kind) {
-                files.insert(kind, AtomicFile::create(&path)?);
-            }
-            let Some(file) = files.get_mut(&kind) else { continue };
+            let file = match files.entry(kind) {
+                Entry::Occupied(file) => file.into_mut(),
+                Entry::Vacant(place) => place.insert(AtomicFile::create(&path)?),
+            };
             if let (LabelFile::Training, ExportCursor::Candidate(decision)) = (kind, row.cursor) {
                 found.trained_on.push(decision);
             }
@@ -179,22 +180,31 @@ fn write_row(
 }
 
 /// A value that is kept in a file of the directory from its first computation on; `None` if that was stopped.
-pub async fn kept<T: Serialize + for<'a> Deserialize<'a>>(
+///
+/// # Errors
+/// Those of the computation; a file that cannot be read or written.
+pub async fn kept<T: Serialize + for<'a> Deserialize<'a>, E: From<CommandError>>(
     path: PathBuf,
-    compute: impl AsyncFnOnce() -> Result<Option<T>, CommandError>,
-) -> Result<Option<T>, CommandError> {
-    match fs::read(&path) {
+    compute: impl AsyncFnOnce() -> Result<Option<T>, E>,
+) -> Result<Option<T>, E> {
+    if let Some(value) = read_kept(&path)? {
+        return Ok(Some(value));
+    }
+    let Some(value) = compute().await? else { return Ok(None) };
+    let mut file = AtomicFile::create(&path)?;
+    let text = serde_json::to_string_pretty(&value).map_err(CommandError::failed)?;
+    writeln!(file, "{text}").map_err(|error| cannot_write(&path, error))?;
+    file.finish()?;
+    Ok(Some(value))
+}
+
+/// `None` if there is no such file.
+fn read_kept<T: for<'a> Deserialize<'a>>(path: &Path) -> Result<Option<T>, CommandError> {
+    match fs::read(path) {
         Ok(bytes) => serde_json::from_slice(&bytes).map(Some).map_err(|error| {
             CommandError::Failed(format!("{}: {error}: remove its directory to begin again", path.display()))
         }),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
-            let Some(value) = compute().await? else { return Ok(None) };
-            let mut file = AtomicFile::create(&path)?;
-            let text = serde_json::to_string_pretty(&value).map_err(CommandError::failed)?;
-            writeln!(file, "{text}").map_err(|error| cannot_write(&path, error))?;
-            file.finish()?;
-            Ok(Some(value))
-        }
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
         Err(error) => Err(CommandError::Failed(format!("cannot read {}: {error}", path.display()))),
     }
 }

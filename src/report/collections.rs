@@ -1,11 +1,11 @@
 //! Statistics of the collected structures and their atoms, sampled if there are too many.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 
 use analysis::SystematicSample;
 use atoms::cell::{norm, sub};
 use atoms::{NeighbourList, Species, Structure, shortest_distance};
-use store::{CollectedStructure, JobState, SeedStructure, Store, StoreError};
+use store::{CollectedStructure, JobState, SeedStructure, Store, StoreError, WalkVersions};
 use wire::{ContentHash, Origin};
 
 use super::features::FeaturesByElement;
@@ -23,8 +23,11 @@ const MAX_NEIGHBOUR_CUTOFF: f64 = 16.0;
 /// Cutoff of the nearest neighbour, in units of the seed structure's shortest distance.
 const MAX_STRETCH: f64 = 2.0;
 
-/// The collected structures of both origins.
+/// The collected structures of both origins, from walks with one version of the potential: features and grades of different
+/// versions cannot be compared. Counts of labels are of all versions.
 pub struct Collections {
+    /// The version. `None` in a campaign whose walks all had version 0.
+    pub version: Option<u32>,
     /// Structures from biased walks.
     pub biased: OriginCollection,
     /// Frames of control walks.
@@ -45,6 +48,8 @@ pub struct OriginCollection {
     pub elements: BTreeMap<Species, u64>,
     /// Numbers of structures by seed structure and status of their labels.
     pub labels: BTreeMap<u32, LabelCounts>,
+    /// Number of structures with labels among those from walks with the version.
+    pub labelled_of_version: u64,
     /// Decisions about the structures whose features are read.
     sampled: SystematicSample<i64>,
 }
@@ -83,26 +88,32 @@ pub struct CollectedAtom {
 }
 
 impl Collections {
-    /// Reads the structures page by page, then the features one structure at a time.
+    /// Reads the structures page by page, then the features one structure at a time. `version` is that of the potential.
     pub async fn read(
         store: &Store,
         protocol: Option<ContentHash>,
         seeds: &[SeedStructure],
+        versions: &WalkVersions,
+        version: u32,
     ) -> Result<Self, StoreError> {
         let shortest = seeds.iter().filter_map(|seed| Some((seed.index, nearest(&seed.structure)?)));
         let shortest: HashMap<_, _> = shortest.collect();
         let (mut biased, mut control) = (OriginCollection::new(), OriginCollection::new());
         let of_both = store.structures_of_both_origins().await?;
-        let mut after = 0;
+        let (mut after, mut shared) = (0, HashSet::new());
         loop {
             let page = store.collected(protocol, after, PAGE_ROWS).await?;
             let Some(last) = page.last() else { break };
             after = last.decision;
             for row in &page {
                 let collection = if row.origin == Origin::Biased { &mut biased } else { &mut control };
-                collection.count(row);
-                if !of_both.contains(&row.block.view().id().content) {
-                    collection.add(row, shortest.get(&row.seed_structure).copied());
+                let id = row.block.view().id();
+                let is_of_version = versions.of(id.walk.0) == version;
+                collection.count(row, is_of_version);
+                match (is_of_version, of_both.contains(&id.content)) {
+                    (false, _) => {}
+                    (true, true) => drop(shared.insert(id.content)),
+                    (true, false) => collection.add(row, shortest.get(&row.seed_structure).copied()),
                 }
             }
         }
@@ -117,7 +128,14 @@ impl Collections {
                 }
             }
         }
-        Ok(Self { biased, control, shared: of_both.len() as u64, features })
+        let version = (!versions.is_single()).then_some(version);
+        Ok(Self { version, biased, control, shared: shared.len() as u64, features })
+    }
+
+    /// Sentence of a caption about the version of the potential. Empty in a campaign whose walks all had version 0.
+    pub fn of_version(&self) -> String {
+        let sentence = |version| format!(" Only from walks with version {version} of the potential.");
+        self.version.map_or(String::new(), sentence)
     }
 
     /// Sentence of a caption about excluded structures. Empty if there are none.
@@ -144,11 +162,13 @@ impl OriginCollection {
             atoms: SystematicSample::new(MAX_ATOMS),
             elements: BTreeMap::new(),
             labels: BTreeMap::new(),
+            labelled_of_version: 0,
             sampled: SystematicSample::new(MAX_WITH_FEATURES),
         }
     }
 
-    fn count(&mut self, row: &CollectedStructure) {
+    fn count(&mut self, row: &CollectedStructure, is_of_version: bool) {
+        self.labelled_of_version += u64::from(is_of_version && row.label_forces.is_some());
         let counts = self.labels.entry(row.seed_structure).or_default();
         counts.structures += 1;
         counts.labelled += u64::from(row.label_forces.is_some());
@@ -191,7 +211,7 @@ impl OriginCollection {
         }
     }
 
-    /// Number of labelled structures.
+    /// Number of labelled structures of all versions.
     pub fn labelled(&self) -> u64 {
         self.labels.values().map(|counts| counts.labelled).sum()
     }

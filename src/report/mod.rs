@@ -19,9 +19,10 @@ use crate::csv::{self, Csv};
 use crate::exit_status::CommandError;
 use crate::page::{self, FigureContent, FigureEntry, PageFile};
 
-/// Reads the campaign and builds all files of its report, the page first.
-pub async fn build(store: &Store) -> Result<Vec<PageFile>, CommandError> {
-    let data = ReportData::read(store).await?;
+/// Reads the campaign and builds all files of its report, the page first. Grades, force errors and features are those of this version
+/// of the potential, or of the newest with labels.
+pub async fn build(store: &Store, version: Option<u32>) -> Result<Vec<PageFile>, CommandError> {
+    let data = ReportData::read(store, version).await?;
     let parts = figures::all(&data);
     let tables = tables::all(&data);
     let text = self::text::write(&data, &parts, &tables);

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use monitor::label_statistics::{self, LabelStatistics};
+use monitor::versions::{CampaignVersions, newest_with_labels};
 use serde_json::Value;
 use store::{
     CampaignRecord, CampaignStatus, FailureCount, FateCount, LabelCost, Protocol, SeedStructure, Store,
@@ -34,6 +35,8 @@ pub struct ReportData {
     pub fates_by_seed_structure: Vec<FateCount>,
     /// The collected structures.
     pub collections: Collections,
+    /// Versions of the potential.
+    pub versions: CampaignVersions,
     /// `None` without a label protocol.
     pub labels: Option<ProtocolLabels>,
     /// Start of the campaign, ms since 1970.
@@ -55,25 +58,33 @@ pub struct ProtocolLabels {
 }
 
 impl ReportData {
-    /// Reads the data page by page.
-    pub async fn read(store: &Store) -> Result<Self, StoreError> {
+    /// Reads the data page by page. Grades, force errors and features are those of one version of the potential: `version`, or
+    /// the newest with labels.
+    pub async fn read(store: &Store, version: Option<u32>) -> Result<Self, StoreError> {
         let campaign = store.campaign().await?;
         let seed_structures = store.seed_structures().await?;
         let protocol = store.protocol_in_force().await?;
         let decisions = store.newest_mixture().await?.decision;
         let part = u32::try_from(decisions.max(1).unsigned_abs().div_ceil(MAX_PARTS)).unwrap_or(u32::MAX);
-        let values = store.values().await?.into_iter();
-        let values = values.filter_map(|(name, text)| Some((name, serde_json::from_str(&text).ok()?)));
-        let collections =
-            Collections::read(store, protocol.as_ref().map(|protocol| protocol.hash), &seed_structures)
-                .await?;
+        let (status, values) = (store.status().await?, store.values().await?);
+        let versions = CampaignVersions::read(store, &status, &values).await?;
+        let values =
+            values.into_iter().filter_map(|(name, text)| Some((name, serde_json::from_str(&text).ok()?)));
+        let (walks, hash) = (store.walk_versions().await?, protocol.as_ref().map(|protocol| protocol.hash));
+        let version = match (version, hash) {
+            (Some(version), _) => version,
+            (None, Some(hash)) => newest_with_labels(store, hash, &walks).await?,
+            (None, None) => walks.newest(),
+        };
+        let collections = Collections::read(store, hash, &seed_structures, &walks, version).await?;
         let labels = match protocol {
-            Some(protocol) => Some(ProtocolLabels::read(store, protocol).await?),
+            Some(protocol) => Some(ProtocolLabels::read(store, protocol, version).await?),
             None => None,
         };
         let first = store.operations(0, 1).await?;
         Ok(Self {
-            status: store.status().await?,
+            status,
+            versions,
             configuration: serde_json::from_str(&campaign.configuration_in_force).unwrap_or_default(),
             values: values.collect(),
             fates: store.fates_by_decision(part).await?,
@@ -88,10 +99,10 @@ impl ReportData {
 }
 
 impl ProtocolLabels {
-    async fn read(store: &Store, protocol: Protocol) -> Result<Self, StoreError> {
+    async fn read(store: &Store, protocol: Protocol, version: u32) -> Result<Self, StoreError> {
         let hash = protocol.hash;
         Ok(Self {
-            statistics: label_statistics::read(store, hash).await?,
+            statistics: label_statistics::read(store, hash, Some(version)).await?,
             costs: store.label_costs(hash, MAX_COSTS).await?,
             failures: store.failures(hash).await?,
             unlabelled: store.unlabelled(hash, true).await?,

@@ -6,6 +6,7 @@ mod forgetting;
 mod labels;
 mod seed_structures;
 mod settings;
+mod versions;
 
 use std::collections::BTreeMap;
 
@@ -38,12 +39,15 @@ pub fn all(data: &ReportData) -> Vec<PageTable> {
         forgetting::components(data),
         conditions::conditions(data),
         seed_structures::seed_structures(data),
+        versions::versions(&data.versions),
+        versions::errors(&data.versions),
     ];
     if let Some(found) = &data.labels {
         tables.extend([
             labels::correlations(&found.statistics),
             labels::quantiles("quantiles-gamma", "γ", &found.statistics.all.gamma),
             labels::quantiles("quantiles-gamma-nbr", "γ_{nbr}", &found.statistics.all.gamma_nbr),
+            versions::grades(&found.statistics),
             labels::energy_offsets(&found.statistics),
             labels::failures(&found.failures),
             labels::unlabelled(&found.unlabelled),

@@ -4,10 +4,10 @@ use quick_xml::events::Event;
 use serde_json::json;
 use store::{
     AtomGrades, CampaignRecord, CandidateRecord, Commit, Decision, Fate, Label, Protocol, SeedStructure,
-    Store,
+    Store, VersionRecord, VersionState, WalkRecord,
 };
-use wire::messages::DeclineReason;
-use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
+use wire::messages::{DeclineReason, WalkProgress};
+use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
 use super::*;
 
@@ -125,7 +125,7 @@ async fn every_setting_is_on_the_page() {
     let keys: serde_json::Map<_, _> = (0..80).map(|k| (format!("key{k:02}"), json!(k))).collect();
     let configuration = json!({ "guard": keys, "walk": { "temperature": 417.0, "volume_ramp": null } });
     let store = begin(directory.path(), &configuration.to_string()).await;
-    let files = build(&store).await.unwrap();
+    let files = build(&store, None).await.unwrap();
     let page = words(file(&files, PAGE));
     for expected in ["[guard]", "key79", "[walk]", "temperature", "417.0", "volume_ramp", "not set"] {
         assert!(page.contains(expected), "{expected}: {page}");
@@ -141,7 +141,7 @@ async fn every_setting_is_on_the_page() {
 async fn missing_data_are_reported() {
     let directory = tempfile::tempdir().unwrap();
     let store = begin(directory.path(), "{}").await;
-    let files = build(&store).await.unwrap();
+    let files = build(&store, None).await.unwrap();
     assert!(!files.iter().any(|file| file.path.starts_with("figures/")), "nothing to draw");
     let page = words(file(&files, PAGE));
     for expected in [
@@ -158,7 +158,7 @@ async fn missing_data_are_reported() {
         offer(&store, step, Origin::Biased, Fate::Accepted, false).await;
     }
     offer(&store, 99, Origin::Biased, Fate::Declined(DeclineReason::Covered), false).await;
-    let files = build(&store).await.unwrap();
+    let files = build(&store, None).await.unwrap();
     let page = words(file(&files, PAGE));
     for expected in ["no force error is known", "The store has no features", "n = 31", "240 atoms"] {
         assert!(page.replace('\u{a0}', "").contains(expected), "{expected}: {page}");
@@ -179,7 +179,7 @@ async fn figures_have_the_numbers_of_the_store() {
         offer(&store, 1000 + step, Origin::Biased, Fate::Declined(DeclineReason::Duplicate), true).await;
     }
     label_all(&store).await;
-    let files = build(&store).await.unwrap();
+    let files = build(&store, None).await.unwrap();
     assert_eq!(files.iter().filter(|file| file.path.ends_with(".png")).count(), 8);
     for svg in files.iter().filter(|file| file.path.ends_with(".svg")) {
         words(std::str::from_utf8(&svg.bytes).unwrap());
@@ -223,6 +223,85 @@ async fn figures_have_the_numbers_of_the_store() {
     let seeds = file(&files, "tables/seed-structures.csv");
     assert!(seeds.contains("\"a<b>&\"\"row\"\"\",Al8,0,,80,40,0,40,0,0,0,40,80,0"), "{seeds}");
 
-    let again = build(&store).await.unwrap();
+    let again = build(&store, None).await.unwrap();
     assert!(files.iter().zip(&again).all(|(a, b)| a.path == b.path && a.bytes == b.bytes), "the same bytes");
+}
+
+/// A walk with this number and version of the potential.
+fn walk(number: u32, version: u32, origin: Origin) -> WalkRecord {
+    WalkRecord {
+        walk: WalkId(number),
+        origin,
+        partner: None,
+        seed_structure: 0,
+        conditions: WalkConditions { version, ..WalkConditions::default() },
+        state: "completed".into(),
+        reason: String::new(),
+        assignments: 0,
+        accepted: 9,
+        progress: WalkProgress::default(),
+        selector_state: "{}".into(),
+        checkpoint: None,
+    }
+}
+
+fn refused_version() -> VersionRecord {
+    let errors =
+        |force_mae: f64| json!({ "energy_mae": 0.01, "force_mae": force_mae, "force_rmse": 2.0 * force_mae });
+    let set = |name: &str, version: f64| json!({ "name": name, "kind": "test", "structures": 5, "parent": errors(0.2), "version": errors(version) });
+    VersionRecord {
+        number: 1,
+        parent: 0,
+        state: VersionState::Refused,
+        reason: "its errors rose".into(),
+        method: "native".into(),
+        structures: 30,
+        last_decision: 30,
+        labels: 25,
+        model_hash: String::new(),
+        mixture_hash: String::new(),
+        figures: json!({ "sets": [set("liquid", 0.1), set("surface", 0.3)] }),
+        seconds: 60.0,
+        core_hours: 0.5,
+        time: 1,
+    }
+}
+
+#[tokio::test]
+async fn versions_are_shown_apart_from_each_other() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = begin(directory.path(), "{}").await;
+    let walks = vec![walk(0, 0, Origin::Biased), walk(1, 2, Origin::Control)];
+    store.commit(&Commit { walks, ..Commit::default() }).await.unwrap();
+    for step in 0..30 {
+        offer(&store, step, Origin::Biased, Fate::Accepted, true).await;
+        offer(&store, step, Origin::Control, Fate::Accepted, true).await;
+    }
+    label_all(&store).await;
+    store.add_version(&refused_version(), None).await.unwrap();
+    let files = build(&store, None).await.unwrap();
+    let page = words(file(&files, PAGE));
+    for expected in
+        ["Versions of the potential", "Only from walks with version 2 of the potential", "its errors rose"]
+    {
+        assert!(page.contains(expected), "{expected}: {page}");
+    }
+    let features = file(&files, "figures/features.csv");
+    assert!(features.contains("Al,control") && !features.contains("Al,biased"), "{features}");
+    let correlations = file(&files, "tables/correlations.csv");
+    assert!(correlations.contains("all,30,240,") && !correlations.contains("biased"), "{correlations}");
+    let grades = file(&files, "tables/version-grades.csv");
+    let rows: Vec<_> = grades.lines().skip(1).map(|row| row.split(',').take(3).collect::<Vec<_>>()).collect();
+    assert_eq!(rows, [["0", "30", "240"], ["2", "30", "240"]]);
+    let errors = file(&files, "tables/version-errors.csv");
+    let rows: Vec<Vec<_>> = errors.lines().skip(1).map(|row| row.split(',').collect()).collect();
+    assert_eq!((rows.len(), rows[0][0], rows[0][4]), (4, "0", "0.2"), "{errors}");
+    assert_eq!((rows[3][0], rows[3][1], rows[3][4]), ("1 (refused)", "surface", "0.3"), "{errors}");
+    let curves = file(&files, "figures/errors-by-cost.csv");
+    assert!(curves.contains("liquid,test,0,in_force,0,5,0.2\n"), "{curves}");
+    file(&files, "figures/errors-by-labels.svg");
+
+    let files = build(&store, Some(0)).await.unwrap();
+    let correlations = file(&files, "tables/correlations.csv");
+    assert!(correlations.contains("biased,30,240,") && !correlations.contains("control"), "{correlations}");
 }

@@ -43,6 +43,16 @@ fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [PageTa
             ]),
         ),
         (
+            "Versions of the potential",
+            blocks(vec![
+                table("versions"),
+                table("version-errors"),
+                numbered("errors-by-labels"),
+                numbered("errors-by-cost"),
+                table("version-grades"),
+            ]),
+        ),
+        (
             "Cost, failures and unlabelled structures",
             blocks(vec![numbered("cost"), table("failures"), numbered("completion"), table("unlabelled")]),
         ),
@@ -54,9 +64,15 @@ fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [PageTa
 fn lead(data: &ReportData) -> String {
     let candidates = &data.status.candidates;
     let (biased, control) = (&data.collections.biased, &data.collections.control);
+    let version = data.collections.version.map_or(String::new(), |version| {
+        format!(
+            " The campaign has trained its potential anew: grades, force errors and features are those of version {version}, of the \
+             structures that its own walks found, and the original mixture is the one that this version began with."
+        )
+    });
     format!(
         "The selector accepted {} structures of {} candidates from biased walks and collected {} frames from control walks; {} of them are \
-         labelled. Unless stated otherwise, grades are those of the original mixture, with which the campaign began.",
+         labelled. Unless stated otherwise, grades are those of the original mixture, with which the campaign began.{version}",
         grouped(candidates.accepted),
         grouped(candidates.seen),
         grouped(candidates.control),

@@ -6,7 +6,9 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use monitor::Snapshot;
+use monitor::end_reason::CampaignEnd;
 use monitor::mixture_values::MixtureValues;
+use monitor::versions::CampaignVersions;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use store::{Location, Store, StoreError, unix_milliseconds};
@@ -36,6 +38,8 @@ pub struct Notifier<'a> {
     interval: Duration,
     tracker: NotificationTracker,
     forgetting: ForgettingRule,
+    /// Whether refits follow when all walks have ended.
+    has_refits: bool,
     commands: JoinSet<(NotifyEvent, Result<(), String>)>,
 }
 
@@ -59,6 +63,7 @@ impl<'a> Notifier<'a> {
             interval: MAX_CHECK_INTERVAL.min(stall / 4).max(Duration::from_millis(100)),
             tracker: NotificationTracker::new(settings.clone(), sent),
             forgetting: ForgettingRule::new(&config.calm),
+            has_refits: config.refit.is_some(),
             commands: JoinSet::new(),
         }))
     }
@@ -71,16 +76,25 @@ impl<'a> Notifier<'a> {
             tokio::select! {
                 _ = ticks.tick() => {
                     // Other parts of the run report a broken database.
-                    let _ = self.check().await;
+                    let _ = self.check(false).await;
                 }
                 Some(done) = self.commands.join_next() => self.log(done.ok()).await,
             }
         }
     }
 
-    async fn check(&mut self) -> Result<(), CommandError> {
-        let mut due = self.tracker.check(&self.store.status().await?, unix_milliseconds());
+    /// `is_last`: the run has ended.
+    async fn check(&mut self, is_last: bool) -> Result<(), CommandError> {
+        let mut status = self.store.status().await?;
         let values = MixtureValues(self.store.values().await?);
+        let versions = CampaignVersions::read(self.store, &status, &values.0).await?;
+        if self.has_refits {
+            // Other walks may follow those of this version of the potential.
+            let is_over = is_last && CampaignEnd::read(self.store, &status).await?.is_some();
+            status.finished &= is_over;
+        }
+        let mut due = self.tracker.check(&status, unix_milliseconds());
+        due.extend(self.tracker.check_versions(&versions));
         if let Ok(measured) = ForgettingMeasurement::deserialize(values.training_frames()) {
             due.extend(self.tracker.check_training(&self.forgetting, &measured));
         }
@@ -138,7 +152,7 @@ pub async fn finish(notifier: Option<Notifier<'_>>, failure: Option<&CommandErro
         // The database may be what failed.
         notifier.notify(due, &Value::Null);
     } else {
-        let _ = notifier.check().await;
+        let _ = notifier.check(true).await;
     }
     while let Some(done) = notifier.commands.join_next().await {
         notifier.log(done.ok()).await;

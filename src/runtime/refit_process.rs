@@ -6,7 +6,8 @@ use std::time::Duration;
 use orchestrator::launcher::{ChildEvent, Children, Launch};
 use orchestrator::selector::CampaignMode;
 use orchestrator::supervisor::{ChildState, Limits};
-use store::{ProcessRecord, Store, StoreError};
+use serde_json::Value;
+use store::{ProcessRecord, Store, StoreError, VersionRecord, VersionState, unix_milliseconds};
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::RunContext;
@@ -86,7 +87,8 @@ impl<'a> RefitProcess<'a> {
         loop {
             tokio::select! {
                 ended = self.finish(), if self.children.is_some() => {
-                    if let Err(error) = ended {
+                    // The walks need no new version.
+                    if let Err(why) = ended && let Err(error) = self.refuse(&why).await {
                         return error;
                     }
                 }
@@ -102,13 +104,37 @@ impl<'a> RefitProcess<'a> {
         }
     }
 
+    /// Records that no version comes of a refit that fails again and again.
+    async fn refuse(&self, why: &CommandError) -> Result<(), CommandError> {
+        let RunContext { store, campaign, .. } = self.run;
+        let versions = store.versions().await?;
+        let record = VersionRecord {
+            number: 1 + versions.last().map_or(0, |version| version.number),
+            parent: campaign.version_number(),
+            state: VersionState::Refused,
+            reason: why.to_string(),
+            method: self.refit.method.name().to_owned(),
+            structures: store.accepted_structures().await?,
+            last_decision: store.newest_mixture().await?.decision,
+            labels: 0,
+            model_hash: String::new(),
+            mixture_hash: String::new(),
+            figures: Value::Null,
+            seconds: 0.0,
+            core_hours: 0.0,
+            time: unix_milliseconds(),
+        };
+        log_and_warn(format_args!("version {} is refused: {why}", record.number));
+        Ok(store.add_version(&record, None).await?)
+    }
+
     async fn check(&mut self) -> Result<(), CommandError> {
         let RunContext { store, campaign, process, superseded, .. } = self.run;
-        let schedule = RefitSchedule::read(store, &campaign.config.stop).await?;
+        let schedule = RefitSchedule::read(store, &campaign.config).await?;
         let newest = schedule.newest().map_or(0, |version| version.number);
         if newest > campaign.version_number() {
             superseded.cancel();
-        } else if schedule.is_due_beside_walks(self.refit, process.started, store::unix_milliseconds()) {
+        } else if schedule.is_due_beside_walks(self.refit, process.started, unix_milliseconds()) {
             self.start()?;
         }
         Ok(())

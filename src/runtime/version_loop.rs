@@ -72,10 +72,10 @@ async fn run_version(
     if ended == RunOutcome::Stopped {
         return Ok(VersionEnd::Campaign(ended));
     }
-    let schedule = RefitSchedule::read(run.store, &run.campaign.config.stop).await?;
+    let schedule = RefitSchedule::read(run.store, &run.campaign.config).await?;
     let next = schedule.in_force().map_or(0, |version| version.number);
     let is_newer = next > run.campaign.version_number();
-    if !is_newer && !schedule.is_due_after_walks(refit) {
+    if !is_newer && !schedule.is_due_after_walks() {
         return Ok(VersionEnd::Campaign(ended));
     }
     if !is_newer {
@@ -94,7 +94,7 @@ pub async fn in_force(
     store: &Store,
     directory: &Path,
 ) -> Result<LoadedCampaign, CommandError> {
-    let schedule = RefitSchedule::read(store, &campaign.config.stop).await?;
+    let schedule = RefitSchedule::read(store, &campaign.config).await?;
     let Some(record) = schedule.in_force().filter(|found| found.number != campaign.version_number()) else {
         return Ok(campaign.clone());
     };
@@ -134,7 +134,7 @@ pub async fn restore_selector(campaign: &LoadedCampaign, store: &Store) -> Resul
 async fn refit_at(campaign: &LoadedCampaign, store: &Store) -> Result<Option<u32>, CommandError> {
     let config = &campaign.config;
     let Some(refit) = &config.refit else { return Ok(None) };
-    let schedule = RefitSchedule::read(store, &config.stop).await?;
+    let schedule = RefitSchedule::read(store, config).await?;
     if config.campaign.mode == CampaignMode::Live && !schedule.is_newest_without_walks() {
         return Ok(None);
     }

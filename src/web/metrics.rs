@@ -8,6 +8,7 @@ use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use monitor::Snapshot;
+use monitor::versions::{CampaignVersions, VersionStanding, VersionSummary};
 use store::{CampaignStatus, Store, unix_milliseconds};
 
 use super::exposition::{CONTENT_TYPE, MetricsText};
@@ -51,6 +52,7 @@ pub fn text(snapshot: &Snapshot) -> String {
         .collect();
     text.gauge("calmwalk_failed_label_jobs", "Label jobs with a failure of this class.", &samples);
     processes(&mut text, status);
+    versions(&mut text, &snapshot.versions);
     if let Some(share) = snapshot.mixture.share_above_one() {
         text.gauge(
             "calmwalk_training_atoms_above_one_ratio",
@@ -171,4 +173,85 @@ fn processes(text: &mut MetricsText, status: &CampaignStatus) {
     let samples: Vec<_> =
         labels.iter().zip(kinds.values()).map(|(labels, count)| (&labels[..], *count as f64)).collect();
     text.gauge("calmwalk_processes", "Processes by kind and state.", &samples);
+}
+
+/// Versions of the potential; nothing in a campaign that has never begun to train one.
+fn versions(text: &mut MetricsText, found: &CampaignVersions) {
+    if found.all.is_empty() && found.refit.is_none() {
+        return;
+    }
+    let in_force = found.in_force().map_or(0, |version| version.number);
+    text.gauge(
+        "calmwalk_version_in_force",
+        "Version of the potential in force; 0 is that of the configuration.",
+        &[(&[], f64::from(in_force))],
+    );
+    let count =
+        |state: VersionStanding| found.all.iter().filter(|version| version.state == state).count() as f64;
+    let states = VersionStanding::ALL.map(|state| [("state", state.name())]);
+    let samples: Vec<_> =
+        states.iter().zip(VersionStanding::ALL).map(|(labels, state)| (&labels[..], count(state))).collect();
+    text.gauge("calmwalk_versions", "Versions of the potential by state.", &samples);
+    force_errors(text, found);
+    text.gauge(
+        "calmwalk_refit_running",
+        "Whether a version of the potential is being trained.",
+        &[(&[], f64::from(u8::from(found.refit.is_some())))],
+    );
+    let sum = |of: fn(&VersionSummary) -> f64| found.all.iter().map(of).fold(0.0, |sum, one| sum + one);
+    text.counter(
+        "calmwalk_refit_seconds_total",
+        "Wall time of refits, refused ones included.",
+        &[(&[], sum(|version| version.seconds))],
+    );
+    text.counter(
+        "calmwalk_refit_core_hours_total",
+        "Core-hours of refits, refused ones included.",
+        &[(&[], sum(|version| version.core_hours))],
+    );
+}
+
+/// Force errors of each version on each data set. Both are few.
+fn force_errors(text: &mut MetricsText, found: &CampaignVersions) {
+    let errors = found.all.iter().flat_map(|version| {
+        let number = version.number.to_string();
+        version.errors.iter().filter_map(move |set| Some((number.clone(), &set.name, set.force_mae()?)))
+    });
+    let errors: Vec<_> = errors.collect();
+    let labels: Vec<_> =
+        errors.iter().map(|(number, set, _)| [("version", number.as_str()), ("set", set.as_str())]).collect();
+    let samples: Vec<_> =
+        labels.iter().zip(&errors).map(|(labels, (.., error))| (&labels[..], *error)).collect();
+    text.gauge(
+        "calmwalk_version_force_mae",
+        "Mean absolute error of force components of a version on a data set, eV/A.",
+        &samples,
+    );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn versions_have_metrics_once_there_are_any() {
+        let snapshot = crate::cli::status::tests::large();
+        let shown = text(&snapshot);
+        for line in [
+            "calmwalk_version_in_force 3",
+            "calmwalk_versions{state=\"in_force\"} 1",
+            "calmwalk_versions{state=\"refused\"} 1",
+            "calmwalk_version_force_mae{version=\"3\",set=\"liquid\"} 0.25",
+            "calmwalk_refit_running 1",
+            "calmwalk_refit_seconds_total 3600",
+            "calmwalk_refit_core_hours_total 15",
+        ] {
+            assert!(shown.lines().any(|found| found == line), "{line}:\n{shown}");
+        }
+        let none = text(&Snapshot { versions: CampaignVersions::default(), ..snapshot });
+        assert!(!none.contains("calmwalk_version") && !none.contains("calmwalk_refit"), "{none}");
+        let docs = include_str!("../../docs/metrics.md");
+        let names = shown.lines().filter_map(|line| line.strip_prefix("# TYPE ")?.split(' ').next());
+        names.for_each(|name| assert!(docs.contains(&format!("| `{name}` |")), "{name}"));
+    }
 }

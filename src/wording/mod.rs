@@ -12,4 +12,5 @@ pub mod json;
 pub mod labels;
 pub mod reference_check;
 pub mod unlabelled;
+pub mod versions;
 pub mod walk_ends;

@@ -77,7 +77,7 @@ pub use relabel::{NewProtocol, RelabelCounts, RelabelRequest, Relabellable};
 pub use report::{CollectedStructure, FateCount};
 pub use status::{CampaignStatus, Candidates, Declined, LabelJobCounts, WalkStatus};
 pub use store::Store;
-pub use versions::{VersionFiles, VersionRecord, VersionState};
+pub use versions::{VersionFiles, VersionRecord, VersionState, WalkVersions};
 pub use walk_progress::{TotalThroughput, WalkProgressRecord};
 
 /// The current time, ms since 1970.

@@ -110,6 +110,8 @@ pub struct FinishedCandidate {
     pub decision: i64,
     /// Name of the candidate.
     pub candidate: String,
+    /// Number of its walk.
+    pub walk: u32,
     /// Whether it has a label; otherwise all attempts failed.
     pub labelled: bool,
     /// Biased or control.

@@ -39,7 +39,8 @@ pub struct CampaignStatus {
     pub processes: Vec<ProcessRecord>,
     /// Limits, use, and the limit that ended the campaign.
     pub budget: BudgetStatus,
-    /// Every walk is over or stopped by a time limit, no label is in progress and none will be started.
+    /// Every walk is over or stopped by a time limit, no label is in progress and none will be started, and no process trains
+    /// a version of the potential.
     pub finished: bool,
 }
 

@@ -1,5 +1,7 @@
 //! Versions of the potential: a model, its mixture and thresholds together, which never change.
 
+use std::ops::Range;
+
 use serde::{Deserialize, Serialize};
 
 /// Whether a version of the potential can drive walks.
@@ -72,4 +74,83 @@ pub struct VersionFiles {
 impl VersionRecord {
     /// [`Self::method`] of a version that is an earlier one again.
     pub const ROLLBACK: &str = "rollback";
+}
+
+/// Which version of the potential drives each walk. Walks of a version have higher numbers than those of the versions before:
+/// when a version is taken up, its walks are created and no others any more.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct WalkVersions {
+    /// First walk and number of each version, by walk. Walks before the first of them have version 0.
+    starts: Vec<(u32, u32)>,
+}
+
+impl WalkVersions {
+    /// From the walks in order, each with its version.
+    pub fn from_walks(walks: impl IntoIterator<Item = (u32, u32)>) -> Self {
+        let mut starts: Vec<(u32, u32)> = Vec::new();
+        for (walk, version) in walks {
+            if starts.last().map_or(0, |(_, last)| *last) != version {
+                starts.push((walk, version));
+            }
+        }
+        Self { starts }
+    }
+
+    /// Whether version 0 drives all walks.
+    pub fn is_single(&self) -> bool {
+        self.starts.is_empty()
+    }
+
+    /// The version of the newest walks.
+    pub fn newest(&self) -> u32 {
+        self.starts.last().map_or(0, |(_, version)| *version)
+    }
+
+    /// The version of a walk.
+    pub fn of(&self, walk: u32) -> u32 {
+        let begun = self.starts.partition_point(|(first, _)| *first <= walk);
+        self.starts[..begun].last().map_or(0, |(_, version)| *version)
+    }
+
+    /// The version of the walk of a candidate, from its name ([`wire::CandidateId`]); 0 for another text.
+    pub fn of_candidate(&self, name: &str) -> u32 {
+        let walk = name.split('-').nth(1).and_then(|place| place.split_once('.'));
+        walk.and_then(|(walk, _)| walk.parse().ok()).map_or(0, |walk| self.of(walk))
+    }
+
+    /// The versions of walks, in order.
+    pub fn numbers(&self) -> impl Iterator<Item = u32> {
+        let first = self.starts.first().is_none_or(|(walk, _)| *walk > 0).then_some(0);
+        first.into_iter().chain(self.starts.iter().map(|(_, version)| *version))
+    }
+
+    /// The walks of a version; empty if it has none.
+    pub fn walks_of(&self, version: u32) -> Range<i64> {
+        let end = |place: usize| self.starts.get(place).map_or(i64::MAX, |(walk, _)| i64::from(*walk));
+        match self.starts.iter().position(|(_, of)| *of == version) {
+            Some(place) => end(place)..end(place + 1),
+            None if version == 0 => 0..end(0),
+            None => 0..0,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn walks_have_the_versions_they_were_created_with() {
+        let versions = WalkVersions::from_walks([(0, 0), (1, 0), (2, 1), (3, 1), (4, 3)]);
+        assert_eq!((0..6).map(|walk| versions.of(walk)).collect::<Vec<_>>(), [0, 0, 1, 1, 3, 3]);
+        assert_eq!((versions.walks_of(0), versions.walks_of(1)), (0..2, 2..4));
+        assert_eq!((versions.walks_of(3), versions.walks_of(2)), (4..i64::MAX, 0..0));
+        assert_eq!((versions.newest(), versions.numbers().collect::<Vec<_>>()), (3, vec![0, 1, 3]));
+        assert_eq!(versions.of_candidate("9f8e7d6c-3.0.1240-0123456789abcdef"), 1);
+        assert_eq!(versions.of_candidate("import-4"), 0);
+        let single = WalkVersions::from_walks([(0, 0), (1, 0)]);
+        assert!(single.is_single() && single.walks_of(0) == (0..i64::MAX));
+        let begun_with_another = WalkVersions::from_walks([(0, 2)]);
+        assert_eq!(begun_with_another.numbers().collect::<Vec<_>>(), [2]);
+    }
 }

@@ -20,3 +20,4 @@ mod queue_model;
 mod relabel;
 mod version_records;
 mod versions;
+mod without_label;

@@ -1,10 +1,10 @@
 //! Results of label jobs, as the cost model, `status` and the table of force errors read them.
 
 use store::{
-    ExportFilter, FailureCount, Fate, FateCount, JobState, LabelUsage, Lease, PendingJobs, RelabelRequest,
-    Store, Unlabelled, ValueRange,
+    Commit, ExportFilter, FailureCount, Fate, FateCount, JobState, LabelUsage, Lease, PendingJobs,
+    RelabelRequest, Store, Unlabelled, ValueRange, WalkRecord,
 };
-use wire::{Candidate, CandidateBlock, ContentHash, Origin};
+use wire::{Candidate, CandidateBlock, ContentHash, Origin, WalkConditions};
 
 use crate::common::*;
 
@@ -246,4 +246,30 @@ async fn collected_structures_come_with_their_labels() {
     store.commit(&commit_of(vec![other])).await.unwrap();
     let walks = store.fates_by_walk().await.unwrap();
     assert_eq!(walks, [fate(0, "accepted", 6), fate(0, "covered", 1), fate(3, "covered", 1)]);
+}
+
+#[tokio::test]
+async fn labels_of_different_versions_are_kept_apart() {
+    let database = TestDatabase::new();
+    let store = database.create().await.with_caller_clock();
+    for number in 0..2 {
+        let conditions = WalkConditions { version: number, ..WalkConditions::default() };
+        let walks = vec![WalkRecord { conditions, ..walk(number, 0) }];
+        let found = candidate(number, 1, Origin::Biased, Fate::Accepted);
+        store.commit(&Commit { walks, ..commit_of(vec![found]) }).await.unwrap();
+    }
+    assert_eq!(store.walk_versions().await.unwrap().numbers().collect::<Vec<_>>(), [0, 1]);
+    let dft = protocol("dft").hash;
+    store.complete(&lease(&store, 0).await, &label(-1.0), 1).await.unwrap();
+    let second = lease(&store, 2).await;
+    let (_, others) = store.near_duplicates(&second, 9).await.unwrap().unwrap();
+    assert_eq!(others, [], "the features of another version say nothing");
+    store.complete(&second, &label(-2.0), 3).await.unwrap();
+    assert_eq!(store.labels_by_walk(dft).await.unwrap(), [(0, 1), (1, 1)]);
+    for (version, expected) in [(0, vec![-1.0]), (1, vec![-2.0]), (2, vec![])] {
+        let energies = store.labelled_energies(dft, version, 9).await.unwrap();
+        assert_eq!(energies.iter().map(|found| found.label).collect::<Vec<_>>(), expected);
+    }
+    let walks: Vec<_> = store.finished(dft, 0, 9).await.unwrap().iter().map(|found| found.walk).collect();
+    assert_eq!(walks, [0, 1]);
 }

@@ -4,7 +4,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use store::{ComponentRecord, ExportFilter, Location, Store};
+use store::{ComponentRecord, ExportFilter, Location, Store, VersionRecord};
 
 use super::config;
 
@@ -102,6 +102,8 @@ pub struct Outcome {
     pub components: Vec<ComponentRecord>,
     pub walks: Vec<(u32, String, u64, Option<Vec<u8>>)>,
     pub dataset: Vec<u8>,
+    /// Versions of the potential: everything but time and cost.
+    pub versions: Vec<VersionRecord>,
 }
 
 /// Progress of a campaign.
@@ -154,7 +156,10 @@ pub fn outcome_at(location: &str, directory: &Path) -> Outcome {
         let store = Store::open_read_only(location).await.expect("the campaign's database");
         check_consistency(&store).await;
         let walks = store.load_walks().await.expect("walks").into_iter();
+        let versions = store.versions().await.expect("versions").into_iter();
+        let without_time = |version| VersionRecord { seconds: 0.0, core_hours: 0.0, time: 0, ..version };
         Outcome {
+            versions: versions.map(without_time).collect(),
             decisions: store.decision_log_text().await.expect("decisions"),
             components: store.load_components().await.expect("components"),
             walks: walks.map(|walk| (walk.walk.0, walk.state, walk.assignments, walk.checkpoint)).collect(),

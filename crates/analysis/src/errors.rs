@@ -100,6 +100,13 @@ impl ForceErrors {
         (self.atoms() > 0).then(|| self.sum / self.atoms() as f64)
     }
 
+    /// Median force error, eV/Å.
+    pub fn median(&self) -> Option<f64> {
+        let (_, mut errors) = self.rows();
+        errors.sort_by(f64::total_cmp);
+        quantile(&errors, 0.5)
+    }
+
     /// Fraction of the labelled atoms in the bins whose lower edge is at least `edge`.
     pub fn fraction_above(&self, edge: f64) -> Option<f64> {
         let is_above = |index: &usize| self.bins.edges(*index).0.is_some_and(|above| above >= edge);
@@ -178,6 +185,7 @@ mod tests {
         assert_eq!((bins[6].median, bins[6].large, bins[6].large_between), (None, None, Some((0.0, 1.0))));
         assert_eq!((bins[1].atoms, bins[1].large_between), (0, None));
         assert_eq!((errors.mean(), errors.fraction_above(1.0)), (Some(3.6 / 5.0), Some(0.4)));
+        assert_eq!(errors.median(), Some(0.3));
         // Grades 0.2 0.5 0.4 3 4 against 0.1 0.3 0.2 1 2: the same order.
         assert!((errors.spearman().unwrap() - 1.0).abs() < 1e-14);
         assert_eq!(errors.roc_auc(), Some(1.0));

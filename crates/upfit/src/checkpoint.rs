@@ -12,12 +12,13 @@ use serde::{Deserialize, Serialize};
 
 use crate::adam::AdamState;
 use crate::differences::FrameDifferences;
+use crate::energy_deviations::EnergyDeviations;
 use crate::energy_zero::EnergyZero;
 use crate::error::UpfitError;
 use crate::progress::{EpochRecord, ErrorsBySet};
 
-/// First line of a file.
-const FORMAT: &[u8] = b"calmwalk upfit checkpoint 1\n";
+/// First line of a file. The number grows with each change of what follows, or of what a training makes of it.
+const FORMAT: &[u8] = b"calmwalk upfit checkpoint 3\n";
 const HASH_BYTES: usize = blake3::OUT_LEN;
 
 /// The state is saved again once this many times the duration of the last time has passed: it costs at most 5 % of the time.
@@ -44,6 +45,8 @@ pub struct TrainingState {
     pub history: Vec<EpochRecord>,
     /// The zero of the energies.
     pub zero: EnergyZero,
+    /// How the energies differ after it was moved.
+    pub spread: EnergyDeviations,
     /// Errors before the first update.
     pub before: ErrorsBySet,
 }
@@ -171,6 +174,7 @@ mod tests {
             weights,
             history: Vec::new(),
             zero: EnergyZero::default(),
+            spread: EnergyDeviations::new(&[("data.extxyz:3", 7.0), ("a", 0.0), ("b", 0.0)]),
             before: ErrorsBySet { training, validation: None },
         }
     }

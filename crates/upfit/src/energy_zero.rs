@@ -1,10 +1,14 @@
 //! The zero of the energies: codes count energies from different zeros, and a fit to energies far from the model's would
 //! first have to learn a constant of each element.
 
+use std::collections::BTreeSet;
+
 use analysis::{EnergyOffsets, LabelledEnergy, quantile};
 use atoms::{Species, element_symbol};
 use potentials::grace::WeightGroup;
 use serde::{Deserialize, Serialize};
+
+use crate::collinearity::{Collinearity, MAX_CONDITION};
 
 /// Smaller shifts are errors of the model and no other zero, eV/atom.
 const SAME_ZERO: f64 = 0.1;
@@ -40,16 +44,18 @@ pub enum EnergyZeroFault {
     /// Compositions that do not distinguish elements, and differences that vary.
     #[error(
         "the labels' energies have another zero than the model's: they differ by {median:.3} eV/atom (median), and the compositions of \
-         {structures} structures do not determine the shifts of {elements}. Subtract the energies of the atoms from the labels, or add \
-         structures of other compositions"
+         {structures} structures do not determine the shifts of {elements}: {reason}. Subtract the energies of the atoms from the \
+         labels, or add structures of other compositions"
     )]
     Undetermined {
         /// Label − model, eV/atom.
         median: f64,
         /// Number of structures.
         structures: usize,
-        /// Symbols.
+        /// Symbols of those whose shifts are not determined.
         elements: String,
+        /// Why they are not, with what is expected.
+        reason: String,
     },
     /// A model without shifts by element.
     #[error(
@@ -65,17 +71,16 @@ pub enum EnergyZeroFault {
 impl EnergyZero {
     /// Fits the shifts of the elements to the differences per atom. They are zero where labels and model have the same zero, up to
     /// 0.1 eV/atom. If the compositions do not determine the shifts, a difference that is the same for all structures is taken
-    /// for each element.
+    /// for each element. [`Collinearity`] has the criterion; the structures of an element must also not all be outliers.
     ///
     /// # Errors
     /// Compositions that do not determine the shifts, and a difference that is not the same for all structures.
     pub fn find(energies: &[LabelledEnergy]) -> Result<Self, EnergyZeroFault> {
-        if let Ok(fit) = EnergyOffsets::fit(energies)
-            && fit.elements().all(|element| element.is_separate)
-        {
-            let shifts = fit.elements().map(|element| (element.element, element.offset));
-            return Ok(Self::new(shifts.collect(), false));
-        }
+        let elements = elements(energies);
+        let weak = match determined_shifts(energies, &elements) {
+            Ok(shifts) => return Ok(Self::new(shifts, false)),
+            Err(weak) => weak,
+        };
         let atoms = |label: &LabelledEnergy| -> f64 {
             label.composition.iter().map(|(_, number)| f64::from(*number)).sum()
         };
@@ -85,16 +90,13 @@ impl EnergyZero {
         if quantile_of(sizes, 0.5) <= SAME_ZERO {
             return Ok(Self::default());
         }
-        let mut elements: Vec<_> =
-            energies.iter().flat_map(|label| label.composition.iter().map(|(element, _)| *element)).collect();
-        elements.sort_unstable();
-        elements.dedup();
         if spread > CONSTANT {
-            let symbols: Vec<_> = elements.into_iter().map(element_symbol).collect();
+            let symbols: Vec<_> = weak.elements.into_iter().map(element_symbol).collect();
             return Err(EnergyZeroFault::Undetermined {
                 median,
                 structures: energies.len(),
                 elements: symbols.join(", "),
+                reason: weak.reason,
             });
         }
         Ok(Self::new(elements.into_iter().map(|element| (element, median)).collect(), true))
@@ -143,8 +145,43 @@ impl EnergyZero {
     }
 }
 
-/// 0 without numbers.
-fn quantile_of(numbers: impl Iterator<Item = f64>, q: f64) -> f64 {
+/// Elements whose shifts are not determined, and why.
+struct WeakElements {
+    elements: Vec<u8>,
+    reason: String,
+}
+
+/// Elements of all structures, ascending.
+fn elements(energies: &[LabelledEnergy]) -> Vec<u8> {
+    let each = energies.iter().flat_map(|label| label.composition.iter().map(|(element, _)| *element));
+    each.collect::<BTreeSet<_>>().into_iter().collect()
+}
+
+/// The shift of each element, if the compositions determine all of them well.
+fn determined_shifts(energies: &[LabelledEnergy], elements: &[u8]) -> Result<Vec<(u8, f64)>, WeakElements> {
+    let collinearity = Collinearity::of(energies, elements);
+    let fit = EnergyOffsets::fit(energies).map_err(|few| WeakElements {
+        elements: elements.to_vec(),
+        reason: format!("expected at least {} structures with energies", few.needed),
+    })?;
+    if !collinearity.elements.is_empty() {
+        let condition = collinearity.condition;
+        let reason = format!("their condition number is {condition:.1e}, expected at most {MAX_CONDITION}");
+        return Err(WeakElements { elements: collinearity.elements, reason });
+    }
+    let found: Vec<_> = fit.elements().filter(|found| found.is_separate).collect();
+    let is_found = |element: &u8| found.iter().any(|found| found.element == *element);
+    let weak: Vec<_> = elements.iter().copied().filter(|element| !is_found(element)).collect();
+    if !weak.is_empty() {
+        let reason =
+            "the energies of all structures with them are outliers, expected one that is none".to_owned();
+        return Err(WeakElements { elements: weak, reason });
+    }
+    Ok(found.iter().map(|found| (found.element, found.offset)).collect())
+}
+
+/// A quantile; 0 without numbers.
+pub fn quantile_of(numbers: impl Iterator<Item = f64>, q: f64) -> f64 {
     let mut ascending: Vec<_> = numbers.collect();
     ascending.sort_by(f64::total_cmp);
     quantile(&ascending, q).unwrap_or(0.0)
@@ -205,6 +242,30 @@ mod tests {
     fn shifts_that_are_not_determined_are_refused() {
         let energies = energies(&ONE_ALLOY, |al, ni| (al + ni) * (5.0 + 0.3 * al));
         let fault = EnergyZero::find(&energies).unwrap_err().to_string();
-        assert!(fault.contains("the compositions of 4 structures") && fault.contains("Al, Ni"), "{fault}");
+        assert!(
+            fault.contains("the compositions of 4 structures") && fault.contains("Al, Ni: their"),
+            "{fault}"
+        );
+        let fault = EnergyZero::find(&energies[..2]).unwrap_err().to_string();
+        assert!(fault.contains("expected at least 3 structures"), "{fault}");
+    }
+
+    #[test]
+    fn compositions_that_hardly_differ_do_not_determine_shifts() {
+        let zeros = |al: f64, ni: f64| -100.0 * al + 7.0 * ni;
+        let close = energies(&[(50, 50), (51, 49), (49, 51), (50, 50)], zeros);
+        let fault = EnergyZero::find(&close).unwrap_err().to_string();
+        assert!(fault.contains("Al, Ni: their condition number is 7.1e1, expected at most 30"), "{fault}");
+        let apart = energies(&[(50, 50), (60, 40), (40, 60), (50, 50)], zeros);
+        assert!((EnergyZero::find(&apart).unwrap().of(&[(13, 1)]) + 100.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn an_element_whose_structures_are_all_outliers_is_named() {
+        // Energies beyond 10⁷ eV/atom count for nothing.
+        let mut energies = energies(&[(4, 0), (3, 0), (2, 0), (0, 4)], |al, ni| 5.0 * al + 1e9 * ni);
+        energies[1].label += 9.0;
+        let fault = EnergyZero::find(&energies).unwrap_err().to_string();
+        assert!(fault.contains("the shifts of Ni: the energies of all structures with them"), "{fault}");
     }
 }

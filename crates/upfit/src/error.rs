@@ -18,6 +18,19 @@ pub enum UpfitError {
         /// The valid values.
         expected: &'static str,
     },
+    /// A stage of the loss without epochs.
+    #[error(
+        "stage {stage} of the loss begins after a share of {begins:.3} of {epochs} epochs and has none; expected at least one epoch \
+         for each stage: train for more epochs"
+    )]
+    StageWithoutEpochs {
+        /// The stage, from 1.
+        stage: usize,
+        /// Share of the epochs after which it begins.
+        begins: f64,
+        /// Number of epochs.
+        epochs: u64,
+    },
     /// A labelled structure that cannot be used.
     #[error("{place}: {fault}")]
     Frame {
@@ -29,33 +42,18 @@ pub enum UpfitError {
     /// No structures to train with.
     #[error("there are no labelled structures to train with")]
     NoFrames,
-    /// A validation set would be empty.
+    /// A single seed structure, of which no part is held out.
     #[error(
-        "the validation set is empty: a share of {share} is at most {limit} of {frames} structures, and the smallest of {groups} \
-         seed structures has {smallest}; a seed structure is not divided: choose a larger share, or name a file for validation"
+        "{structures} structures belong to one seed structure, {group}; expected at least 2 to hold out a share of {share} for \
+         validation, since a seed structure is not divided: name a file for validation, or a share of 0 to train without"
     )]
-    NoValidation {
-        /// The share asked for.
-        share: f64,
-        /// The largest number of structures for validation.
-        limit: usize,
-        /// Number of structures.
-        frames: usize,
-        /// Number of seed structures.
-        groups: usize,
-        /// Structures of the smallest of them.
-        smallest: usize,
-    },
-    /// All structures would be validated with.
-    #[error(
-        "the training set is empty: a share of {share} of {frames} structures leaves none to train with; choose a smaller share, or \
-         name a file for validation"
-    )]
-    NoTraining {
+    OneGroup {
         /// The share asked for.
         share: f64,
         /// Number of structures.
-        frames: usize,
+        structures: usize,
+        /// The seed structure.
+        group: String,
     },
     /// A group of weights to freeze that the model does not have.
     #[error("no weights of the model have a name that begins with '{pattern}'; it has {known}")]

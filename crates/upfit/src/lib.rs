@@ -5,17 +5,19 @@
 //! sums, which are added in the order of the frames, and random numbers are a function of random seed and epoch.
 
 mod adam;
+mod batch_gradient;
 mod checkpoint;
+mod collinearity;
 mod data;
 mod differences;
+mod energy_deviations;
 mod energy_zero;
-mod epoch;
 mod error;
 mod evaluation;
 mod frozen;
+mod identity;
 mod learning_rate;
 mod loss;
-mod parallel;
 mod prepared;
 mod progress;
 mod settings;
@@ -25,9 +27,10 @@ mod test_frames;
 mod trainer;
 
 pub use data::{FrameFault, LabelledFrame, MAX_ENERGY_DIFFERENCE, MAX_FORCE, TrainingData, data_hash};
+pub use energy_deviations::{EnergyDeviations, FarStructure};
 pub use energy_zero::{ElementShift, EnergyZero, EnergyZeroFault};
 pub use error::UpfitError;
-pub use evaluation::errors_of;
+pub use evaluation::{StopRequest, errors_of, zero_of_labels};
 pub use learning_rate::CosineDecay;
 pub use loss::{LossSettings, LossStage, LossWeights};
 pub use progress::{EpochRecord, ErrorsBySet, SetErrors, TrainingEvent, UpdateProgress};

@@ -61,6 +61,15 @@ impl LossSettings {
         let begun = |stage: &LossStage| stage.begins * epochs as f64 <= epoch as f64 + 1e-6;
         self.stages.iter().rposition(begun).unwrap_or(0)
     }
+
+    /// Index of the first stage that none of `epochs` epochs belongs to.
+    pub(crate) fn empty_stage(&self, epochs: u64) -> Option<usize> {
+        let all = epochs as f64;
+        // As in [`LossSettings::stage`].
+        let first = |stage: &LossStage| (stage.begins * all - 1e-6).ceil();
+        let ends = self.stages.iter().skip(1).map(first).chain([all]);
+        self.stages.iter().map(first).zip(ends).position(|(begin, end)| begin >= end)
+    }
 }
 
 /// Number of terms in each mean of a batch, at least 1.
@@ -143,6 +152,23 @@ mod tests {
         assert_eq!(stages, [0, 0, 1, 1]);
         assert_eq!([0, 4, 5].map(|epoch| paper.stage(epoch, 12)), [0, 0, 1]);
         assert_eq!(LossSettings::demo().stage(7, 8), 0);
+    }
+
+    #[test]
+    fn a_stage_without_epochs_is_found() {
+        let paper = LossSettings::paper();
+        for epochs in 1..50 {
+            let used: Vec<_> = (0..epochs).map(|epoch| paper.stage(epoch, epochs)).collect();
+            let empty = (0..2).find(|stage| !used.contains(stage));
+            assert_eq!(paper.empty_stage(epochs), empty, "{epochs}");
+        }
+        assert_eq!(paper.empty_stage(1), Some(1));
+        assert_eq!((paper.empty_stage(0), paper.empty_stage(u64::MAX)), (Some(0), None));
+        let with = |begins: &[f64]| {
+            let stage = |begins: &f64| LossStage { begins: *begins, ..paper.stages[0] };
+            LossSettings { stages: begins.iter().map(stage).collect(), delta: 0.01 }.empty_stage(100)
+        };
+        assert_eq!([with(&[0.0, 0.5]), with(&[0.0, 0.5, 0.5]), with(&[0.0, 1.0])], [None, Some(1), Some(1)]);
     }
 
     /// A model's result that differs from the labels by about δ, in both directions.

@@ -7,6 +7,7 @@ use potentials::grace::GraceModel;
 
 use crate::data::{FrameFault, LabelledFrame};
 use crate::error::UpfitError;
+use crate::evaluation::StopRequest;
 
 /// Memory for neighbour lists that are built once, bytes. The others are built at each use.
 pub const NEIGHBOUR_BYTES: usize = 4 << 30;
@@ -22,7 +23,8 @@ pub struct PreparedFrame<'a> {
     neighbours: Option<NeighbourList>,
 }
 
-/// Builds the neighbour lists of all frames, and keeps them while they fit `room` (bytes), which is reduced.
+/// Builds the neighbour lists of all frames, and keeps them while they fit `room` (bytes), which is reduced. Returns `None` if `stop`
+/// asked for it.
 ///
 /// # Errors
 /// A frame with an element that the model lacks, or whose neighbour list cannot be built.
@@ -30,9 +32,13 @@ pub fn prepare<'a>(
     model: &GraceModel,
     frames: &'a [LabelledFrame],
     room: &mut usize,
-) -> Result<Vec<PreparedFrame<'a>>, UpfitError> {
+    stop: StopRequest<'_>,
+) -> Result<Option<Vec<PreparedFrame<'a>>>, UpfitError> {
     let mut prepared = Vec::with_capacity(frames.len());
     for frame in frames {
+        if stop() {
+            return Ok(None);
+        }
         model.element_indices(&frame.structure.species).map_err(|error| frame.wrong(error.into()))?;
         let mut made = PreparedFrame { frame, cutoff: model.cutoff(), neighbours: None };
         let list = made.build().map_err(|fault| frame.wrong(fault))?;
@@ -43,7 +49,7 @@ pub fn prepare<'a>(
         }
         prepared.push(made);
     }
-    Ok(prepared)
+    Ok(Some(prepared))
 }
 
 impl PreparedFrame<'_> {
@@ -74,11 +80,11 @@ mod tests {
     fn lists_are_kept_while_they_fit() {
         let (model, frames) = (model(), aluminium(3));
         let mut room = usize::MAX;
-        let kept = prepare(model.model(), &frames, &mut room).unwrap();
+        let kept = prepare(model.model(), &frames, &mut room, &|| false).unwrap().unwrap();
         let used = usize::MAX - room;
         assert!(used > 0 && kept.iter().all(|frame| matches!(frame.neighbours(), Ok(Cow::Borrowed(_)))));
         let mut little = used / 2;
-        let some = prepare(model.model(), &frames, &mut little).unwrap();
+        let some = prepare(model.model(), &frames, &mut little, &|| false).unwrap().unwrap();
         let owned = some.iter().filter(|frame| matches!(frame.neighbours(), Ok(Cow::Owned(_)))).count();
         assert!((1..3).contains(&owned), "{owned}");
         for (a, b) in kept.iter().zip(&some) {
@@ -91,7 +97,7 @@ mod tests {
     fn an_element_that_the_model_lacks_is_named() {
         let mut frames = aluminium(2);
         frames[1].structure.species[4] = atoms::Species::from_atomic_number(14).unwrap();
-        let Err(error) = prepare(model().model(), &frames, &mut 0) else { panic!("silicon") };
+        let Err(error) = prepare(model().model(), &frames, &mut 0, &|| false) else { panic!("silicon") };
         let message = error.to_string();
         assert!(message.contains(&frames[1].place) && message.contains("atom 4 is Si"), "{message}");
     }

@@ -2,10 +2,11 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::energy_deviations::EnergyDeviations;
 use crate::energy_zero::EnergyZero;
 
 /// Errors of a model on a set of structures: mean absolute (MAE) and root mean square (RMSE).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SetErrors {
     /// Number of structures.
     pub structures: u64,
@@ -62,10 +63,14 @@ pub struct UpdateProgress {
     pub all_updates: u64,
     /// Of this process.
     pub updates_per_second: f64,
-    /// Expected time until the last epoch ends.
-    pub seconds_left: f64,
+    /// Expected time until the last epoch ends; `None` before this process has made an update.
+    pub seconds_left: Option<f64>,
+    /// Of the last update.
+    pub learning_rate: f64,
     /// Loss of the last batch, before its update.
     pub loss: f64,
+    /// Of the epoch so far, each batch before its update.
+    pub errors: SetErrors,
 }
 
 /// An event of a training.
@@ -77,11 +82,18 @@ pub enum TrainingEvent<'a> {
         resumed: Option<u64>,
         /// How the zero of the energies was moved.
         zero: &'a EnergyZero,
+        /// How the labels' energies differ from the model's after it was moved.
+        spread: &'a EnergyDeviations,
         /// Errors before the first update.
         before: &'a ErrorsBySet,
     },
     /// An update was made.
     Update(UpdateProgress),
     /// An epoch is over.
-    Epoch(&'a EpochRecord),
+    Epoch {
+        /// What it brought.
+        record: &'a EpochRecord,
+        /// Expected time until the last epoch ends; `None` before this process has made an update.
+        seconds_left: Option<f64>,
+    },
 }

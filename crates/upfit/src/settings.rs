@@ -31,7 +31,7 @@ impl UpfitSettings {
     /// Checks ranges.
     ///
     /// # Errors
-    /// A setting out of its range.
+    /// A setting out of its range; a stage of the loss without epochs.
     pub fn check(&self) -> Result<(), UpfitError> {
         let CosineDecay { first, last } = self.learning_rate;
         let weights = self.loss.stages.iter().map(|stage| stage.weights);
@@ -73,8 +73,14 @@ impl UpfitSettings {
             ),
             (self.patience != Some(0), "the patience", "0".to_owned(), "1 epoch or more"),
         ];
-        match rules.into_iter().find(|(holds, ..)| !holds) {
-            Some((_, name, found, expected)) => Err(UpfitError::Setting { name, found, expected }),
+        if let Some((_, name, found, expected)) = rules.into_iter().find(|(holds, ..)| !holds) {
+            return Err(UpfitError::Setting { name, found, expected });
+        }
+        match self.loss.empty_stage(self.epochs) {
+            Some(index) => {
+                let begins = self.loss.stages[index].begins;
+                Err(UpfitError::StageWithoutEpochs { stage: index + 1, begins, epochs: self.epochs })
+            }
             None => Ok(()),
         }
     }
@@ -113,7 +119,7 @@ mod tests {
     #[test]
     fn settings_out_of_range_are_named() {
         settings().check().unwrap();
-        let changes: [(Change, &str); 8] = [
+        let changes: [(Change, &str); 9] = [
             (|settings| settings.epochs = 0, "the number of epochs is 0, expected 1 or more"),
             (|settings| settings.batch_size = 0, "the batch size is 0"),
             (|settings| settings.learning_rate.first = f64::NAN, "the learning rate is NaN"),
@@ -122,6 +128,10 @@ mod tests {
             (|settings| settings.loss.stages[0].weights.energy = -1.0, "a weight of the loss"),
             (|settings| settings.average = Some(1.0), "the decay of the average"),
             (|settings| settings.patience = Some(0), "the patience is 0"),
+            (
+                |settings| (settings.epochs, settings.loss) = (1, LossSettings::paper()),
+                "stage 2 of the loss begins after a share of 0.417 of 1 epochs and has none",
+            ),
         ];
         for (change, expected) in changes {
             let mut changed = settings();

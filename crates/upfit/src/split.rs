@@ -10,11 +10,12 @@ use crate::error::UpfitError;
 /// Stands for the split among the uses of the random seed; epochs have the numbers from 0.
 const SPLIT: u64 = u64::MAX;
 
-/// Takes about this share of the frames for validation: whole groups (seed structures) in random order, each that still fits.
-/// The choice is a function of the order of the groups and of `seed`. With a share of 0 there is no validation.
+/// Takes about this share of the frames for validation: whole groups (seed structures) in random order, each that still fits, but
+/// not all. If none fits, the smallest group is taken, the first such in that order. The choice is a function of the order of the
+/// groups and of `seed`. With a share of 0 there is no validation.
 ///
 /// # Errors
-/// No frames; no group that fits, so that the validation set would be empty; no frames left to train with.
+/// No frames; a single group, which cannot be divided.
 pub fn split(frames: Vec<LabelledFrame>, share: f64, seed: u64) -> Result<TrainingData, UpfitError> {
     if frames.is_empty() {
         return Err(UpfitError::NoFrames);
@@ -23,29 +24,38 @@ pub fn split(frames: Vec<LabelledFrame>, share: f64, seed: u64) -> Result<Traini
         return Ok(TrainingData { training: frames, validation: Vec::new() });
     }
     let groups = groups(&frames);
-    let all = frames.len();
-    let limit = (share * all as f64).ceil() as usize;
-    let mut is_validation = vec![false; all];
-    let mut taken = 0;
-    for group in shuffled(seed, SPLIT, groups.len()) {
-        let members = &groups[group];
-        if taken + members.len() <= limit {
-            taken += members.len();
-            members.iter().for_each(|&frame| is_validation[frame] = true);
-        }
+    if groups.len() < 2 {
+        let (structures, group) = (frames.len(), frames[0].group.clone());
+        return Err(UpfitError::OneGroup { share, structures, group });
     }
-    if taken == 0 {
-        let smallest = groups.iter().map(Vec::len).min().unwrap_or_default();
-        return Err(UpfitError::NoValidation { share, limit, frames: all, groups: groups.len(), smallest });
-    }
-    if taken == all {
-        return Err(UpfitError::NoTraining { share, frames: all });
+    let mut is_validation = vec![false; frames.len()];
+    for group in held_out(&groups, share, seed) {
+        groups[group].iter().for_each(|&frame| is_validation[frame] = true);
     }
     let mut data = TrainingData::default();
     for (frame, is_validation) in frames.into_iter().zip(is_validation) {
         if is_validation { data.validation.push(frame) } else { data.training.push(frame) }
     }
     Ok(data)
+}
+
+/// Indices of the groups for validation, of two or more: at least one, and not all.
+fn held_out(groups: &[Vec<usize>], share: f64, seed: u64) -> Vec<usize> {
+    let all: usize = groups.iter().map(Vec::len).sum();
+    let limit = ((share * all as f64).ceil() as usize).min(all - 1);
+    let order = shuffled(seed, SPLIT, groups.len());
+    let mut taken = 0;
+    let fits = |&group: &usize| {
+        let with_it = taken + groups[group].len();
+        let fits = with_it <= limit;
+        taken = if fits { with_it } else { taken };
+        fits
+    };
+    let fitting: Vec<_> = order.iter().copied().filter(fits).collect();
+    if fitting.is_empty() {
+        return order.into_iter().min_by_key(|&group| groups[group].len()).into_iter().collect();
+    }
+    fitting
 }
 
 /// Indices of the frames of each group, in the order in which the groups come.
@@ -98,11 +108,23 @@ mod tests {
     }
 
     #[test]
-    fn empty_sets_are_refused() {
+    fn the_smallest_group_is_held_out_if_none_fits() {
+        for seed in 0..10 {
+            let data = split(frames(&["a", "a", "a", "b", "b", "c", "c", "c"]), 0.1, seed).unwrap();
+            let held: Vec<_> = data.validation.iter().map(|frame| frame.place.as_str()).collect();
+            assert_eq!((held, data.training.len()), (vec!["3", "4"], 6));
+            // The largest share leaves a group to train with.
+            let data = split(frames(&["a", "b"]), 0.9, seed).unwrap();
+            assert_eq!((data.training.len(), data.validation.len()), (1, 1));
+        }
+    }
+
+    #[test]
+    fn a_single_group_is_refused() {
         let message = |groups: &[&str], share| split(frames(groups), share, 1).unwrap_err().to_string();
-        let empty = message(&["a"; 20], 0.1);
-        assert!(empty.contains("the validation set is empty") && empty.contains("has 20"), "{empty}");
-        assert!(message(&["a", "b"], 0.9).contains("the training set is empty"));
+        let one = message(&["fcc"; 20], 0.1);
+        assert!(one.contains("20 structures belong to one seed structure, fcc;"), "{one}");
+        assert!(one.contains("expected at least 2 to hold out a share of 0.1"), "{one}");
         assert!(message(&[], 0.1).contains("no labelled structures"));
         assert!(split(frames(&["a"]), 0.0, 1).unwrap().validation.is_empty());
     }

@@ -111,6 +111,10 @@ pub(super) async fn labels(
     model: Option<&CandidateView<'_>>,
 ) -> Result<Vec<CandidateLabel>, StoreError> {
     let (mut references, mut labels) = (BTreeMap::new(), Vec::new());
+    let version = match model {
+        Some(view) => store.walk_versions().await?.of(view.id().walk.0),
+        None => 0,
+    };
     for label in store.labels_of(content).await? {
         let Some(view) = model else {
             labels.push(CandidateLabel::new(label, None));
@@ -119,7 +123,7 @@ pub(super) async fn labels(
         let protocol = label.protocol.hash;
         let references = match references.entry(protocol.0) {
             Entry::Occupied(known) => known.into_mut(),
-            Entry::Vacant(new) => new.insert(ProtocolEnergyOffsets::fit(store, protocol).await?),
+            Entry::Vacant(new) => new.insert(ProtocolEnergyOffsets::fit(store, protocol, version).await?),
         };
         let made = &label.record.label;
         let model = ForceError::new(view, made.energy, &made.forces, references);

@@ -18,6 +18,8 @@ const NEIGHBOUR_CUTOFF: f64 = 8.0;
 pub struct Discovery {
     /// Number of the walk.
     pub walk: u32,
+    /// Version of the potential that drives it; 0 is that of the configuration. The energy, the forces and the grades are its own.
+    pub version: u32,
     /// Segment of the walk, from 0. Each rollback to a checkpoint starts a new one.
     pub segment: u32,
     /// Step, equilibration included.
@@ -84,6 +86,7 @@ impl Discovery {
         let of_seed = seed.as_ref().and_then(|seed| shortest_distances(&seed.structure));
         Ok(Self {
             walk: id.walk.0,
+            version: store.walk_versions().await?.of(id.walk.0),
             segment: id.segment,
             step: id.step,
             seed_structure: stored.seed_structure,

@@ -8,7 +8,7 @@ use super::{ErrorsByGrade, LARGE_FORCE_ERROR, LabelStatistics};
 
 /// See [`LabelStatistics::to_json`].
 pub(super) fn to_json(protocol: &Protocol, statistics: &LabelStatistics) -> Value {
-    json!({
+    let mut json = json!({
         "protocol": protocol.name,
         "protocol_hash": protocol.hash.to_string(),
         "large": LARGE_FORCE_ERROR,
@@ -19,6 +19,23 @@ pub(super) fn to_json(protocol: &Protocol, statistics: &LabelStatistics) -> Valu
         "shared_structures": statistics.shared,
         "completion_by_gamma": completion_as_json(&statistics.by_gamma.bins()),
         "completion_by_relative_volume": completion_as_json(&statistics.by_expansion.bins()),
+    });
+    if let Some(version) = statistics.version {
+        json["version"] = version.into();
+        json["by_version"] = statistics.by_version.iter().map(version_as_json).collect();
+    }
+    json
+}
+
+fn version_as_json((version, grades): (&u32, &ErrorsByGrade)) -> Value {
+    let one = |errors: &analysis::ForceErrors| {
+        let (spearman, roc_auc) = (errors.spearman(), errors.roc_auc());
+        json!({ "spearman": spearman, "roc_auc": roc_auc, "sampled_atoms": errors.sampled() })
+    };
+    json!({
+        "version": version, "structures": grades.structures, "atoms": grades.gamma.atoms(),
+        "mean_error": grades.gamma.mean(), "median_error": grades.gamma.median(), "gamma": one(&grades.gamma),
+        "gamma_nbr": one(&grades.gamma_nbr),
     })
 }
 

@@ -3,13 +3,19 @@
 
 mod json;
 
+use std::collections::{BTreeMap, HashSet};
+
 use analysis::{Bins, Completion, ForceErrors};
 use atoms::cell::{norm, sub};
 use serde_json::Value;
-use store::{AtomGrades, ExportFilter, ExportSource, FinishedCandidate, Protocol, Store, StoreError};
+use store::{
+    AtomGrades, ExportFilter, ExportRow, ExportSource, FinishedCandidate, Protocol, Store, StoreError,
+    WalkVersions,
+};
 use wire::{ContentHash, Origin};
 
 use crate::energy_errors::{EnergyErrors, ProtocolEnergyOffsets};
+use crate::versions::newest_with_labels;
 
 /// Force errors above this count as large, eV/Å, as in the paper.
 pub const LARGE_FORCE_ERROR: f64 = 1.0;
@@ -18,6 +24,8 @@ pub const LARGE_FORCE_ERROR: f64 = 1.0;
 const PAGE_ROWS: u32 = 256;
 /// Largest number of atoms kept for ranks and quantiles. Beyond it a systematic sample is kept.
 const MAX_SAMPLES: usize = 1 << 20;
+/// The same of each version of the potential, for comparisons between versions.
+const MAX_SAMPLES_OF_VERSION: usize = 1 << 18;
 
 /// Force errors by both grades of the original mixture.
 #[derive(Clone, Debug)]
@@ -30,9 +38,15 @@ pub struct ErrorsByGrade {
     pub gamma_nbr: ForceErrors,
 }
 
-/// Statistics of the labels of one protocol.
+/// Statistics of the labels of one protocol, of structures from walks with one version of the potential: its forces and grades
+/// say nothing about another version.
 #[derive(Clone, Debug)]
 pub struct LabelStatistics {
+    /// The version. `None` in a campaign whose walks all had version 0.
+    pub version: Option<u32>,
+    /// The errors of each version with labels, of all its structures, by number; each by its own grades. Empty in a campaign whose
+    /// walks all had version 0.
+    pub by_version: BTreeMap<u32, ErrorsByGrade>,
     /// Of all structures.
     pub all: ErrorsByGrade,
     /// Of structures from biased walks.
@@ -50,13 +64,24 @@ pub struct LabelStatistics {
     pub by_expansion: Completion<String>,
 }
 
-/// Reads the labels of one protocol page by page.
-pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistics, StoreError> {
+/// Reads the labels of one protocol page by page. Without `version`, the statistics are those of the newest version with labels.
+pub async fn read(
+    store: &Store,
+    protocol: ContentHash,
+    version: Option<u32>,
+) -> Result<LabelStatistics, StoreError> {
+    let versions = store.walk_versions().await?;
+    let version = match version {
+        Some(version) => version,
+        None => newest_with_labels(store, protocol, &versions).await?,
+    };
     let mut statistics = LabelStatistics {
-        all: ErrorsByGrade::new(),
-        biased: ErrorsByGrade::new(),
-        control: ErrorsByGrade::new(),
-        energies: EnergyErrors::new(ProtocolEnergyOffsets::fit(store, protocol).await?),
+        version: (!versions.is_single()).then_some(version),
+        by_version: BTreeMap::new(),
+        all: ErrorsByGrade::new(MAX_SAMPLES),
+        biased: ErrorsByGrade::new(MAX_SAMPLES),
+        control: ErrorsByGrade::new(MAX_SAMPLES),
+        energies: EnergyErrors::new(ProtocolEnergyOffsets::fit(store, protocol, version).await?),
         shared: 0,
         by_gamma: Completion::new(Bins::for_grades()),
         by_expansion: Completion::new(Bins::for_volume_ratio()),
@@ -68,29 +93,15 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistic
         let page = store.labelled(&filter, after, PAGE_ROWS).await?;
         let Some(last) = page.last() else { break };
         after = Some(last.cursor);
-        for row in &page {
-            let ExportSource::Candidate { origin, block, original, .. } = &row.source else { continue };
-            let forces = block.view().forces;
-            let errors = forces.iter().zip(&row.label.forces).map(|(model, label)| norm(sub(*model, *label)));
-            let errors: Vec<_> = errors.collect();
-            match (shared.contains(&block.view().id().content), *origin) {
-                (false, origin) => statistics.for_origin(origin, |grades| grades.labelled(original, &errors)),
-                (true, Origin::Biased) => {
-                    statistics.shared += 1;
-                    statistics.all.labelled(original, &errors);
-                }
-                // Counted with the biased walk.
-                (true, Origin::Control) => continue,
-            }
-            statistics.energies.add(&row.structure, block.view().energy(), row.label.energy);
-        }
+        page.iter().for_each(|row| statistics.labelled(row, (&versions, version), &shared));
     }
     let mut after = 0;
     loop {
         let page = store.finished(protocol, after, PAGE_ROWS).await?;
         let Some(last) = page.last() else { break };
         after = last.decision;
-        page.iter().for_each(|candidate| statistics.finished(candidate));
+        let own = page.iter().filter(|candidate| versions.of(candidate.walk) == version);
+        own.for_each(|candidate| statistics.finished(candidate));
     }
     Ok(statistics)
 }
@@ -104,6 +115,42 @@ impl LabelStatistics {
     fn for_origin(&mut self, origin: Origin, mut change: impl FnMut(&mut ErrorsByGrade)) {
         let of_origin = if origin == Origin::Biased { &mut self.biased } else { &mut self.control };
         [&mut self.all, of_origin].into_iter().for_each(&mut change);
+    }
+
+    /// Adds a labelled structure if its walk had `version`. `shared`: structures that walks of both origins found.
+    fn labelled(
+        &mut self,
+        row: &ExportRow,
+        (versions, version): (&WalkVersions, u32),
+        shared: &HashSet<ContentHash>,
+    ) {
+        let ExportSource::Candidate { origin, block, original, .. } = &row.source else { return };
+        let view = block.view();
+        let errors = view.forces.iter().zip(&row.label.forces);
+        let errors: Vec<_> = errors.map(|(model, label)| norm(sub(*model, *label))).collect();
+        let (of, is_shared) = (versions.of(view.id().walk.0), shared.contains(&view.id().content));
+        if is_shared && *origin == Origin::Control {
+            // Counted with the biased walk.
+            return;
+        }
+        if !versions.is_single() {
+            self.of_version(of).labelled(original, &errors);
+        }
+        if of != version {
+            return;
+        }
+        match is_shared {
+            false => self.for_origin(*origin, |grades| grades.labelled(original, &errors)),
+            true => {
+                self.shared += 1;
+                self.all.labelled(original, &errors);
+            }
+        }
+        self.energies.add(&row.structure, view.energy(), row.label.energy);
+    }
+
+    fn of_version(&mut self, version: u32) -> &mut ErrorsByGrade {
+        self.by_version.entry(version).or_insert_with(|| ErrorsByGrade::new(MAX_SAMPLES_OF_VERSION))
     }
 
     fn finished(&mut self, candidate: &FinishedCandidate) {
@@ -122,8 +169,8 @@ impl LabelStatistics {
 }
 
 impl ErrorsByGrade {
-    fn new() -> Self {
-        let errors = ForceErrors::new(Bins::for_grades(), LARGE_FORCE_ERROR, MAX_SAMPLES);
+    fn new(samples: usize) -> Self {
+        let errors = ForceErrors::new(Bins::for_grades(), LARGE_FORCE_ERROR, samples);
         Self { structures: 0, gamma: errors.clone(), gamma_nbr: errors }
     }
 

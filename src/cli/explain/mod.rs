@@ -120,6 +120,14 @@ fn write_found(out: &mut dyn Write, found: &Discovery) -> io::Result<()> {
              V/V₀ {relative_volume:.4}"
         ),
     )?;
+    if found.version > 0 {
+        let version = found.version;
+        line(
+            out,
+            "",
+            &format!("with version {version} of the potential, which its energy and grades are of"),
+        )?;
+    }
     if let Some(biased) = found.control_of {
         let partner = found.partner.as_ref().map_or_else(
             || "which had no accepted candidate at this step".to_owned(),
@@ -174,5 +182,36 @@ fn write_same(out: &mut dyn Write, details: &CandidateDetails) -> io::Result<()>
     match details.same_import {
         Some(import) => line(out, "the same as", &format!("import-{import}")),
         None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_version_of_the_walk_is_named_unless_it_is_that_of_the_configuration() {
+        let text = |version| {
+            let found = Discovery {
+                walk: 3,
+                version,
+                segment: 0,
+                step: 100,
+                seed_structure: 0,
+                seed_structure_name: "fcc".into(),
+                temperature: 300.0,
+                relative_volume: 1.0,
+                energy: -1.0,
+                control_of: None,
+                partner: None,
+                distances: GuardDistances { shortest: None, atoms: None, pairs: Vec::new() },
+                walk_now: None,
+            };
+            let mut out = Vec::new();
+            write_found(&mut out, &found).unwrap();
+            String::from_utf8(out).unwrap()
+        };
+        assert!(text(2).contains("with version 2 of the potential"), "{}", text(2));
+        assert!(!text(0).contains("version"), "{}", text(0));
     }
 }

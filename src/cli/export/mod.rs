@@ -27,8 +27,9 @@ const BAR: &str = "{spinner} {pos} structures";
 /// Structures are in the order of the decisions, whenever their labels were computed: the same campaign gives the same bytes.
 /// In addition to the label, each frame has campaign, candidate_id, seed_structure, walk, segment, step, origin,
 /// mixture_version (after the decision), mixture_version_seen (by the walker), protocol, protocol_hash and relative_volume
-/// (V/V₀), and per atom gamma and gamma_nbr under the original mixture. Imported structures have source_file and source_frame
-/// (from 0) instead. If the calculation provides them, there are also energy_without_smearing (eV), magmom (magnetic moment of
+/// (V/V₀), and per atom gamma and gamma_nbr under the original mixture; in a campaign with several versions of the potential also
+/// calmwalk_version, that of the walk, and grades of different versions cannot be compared. Imported structures have
+/// source_file and source_frame (from 0) instead. If the calculation provides them, there are also energy_without_smearing (eV), magmom (magnetic moment of
 /// the cell, μ_B) and per atom magmoms (μ_B). Fails without writing a file if the database is damaged or incomplete. See
 /// docs/export.md.
 #[derive(Debug, clap::Args)]
@@ -50,9 +51,9 @@ pub struct ExportArgs {
     /// Export only structures that match a filter, such as 'gamma > 2 and element = Mo'
     ///
     /// Combine comparisons with and, or, not and parentheses. Numbers (= != < <= > >=): gamma, gamma_nbr (largest of the
-    /// structure, original mixture), relative_volume (V/V₀), kinetic_temperature (of the structure, K), temperature (K) and tau
-    /// (of the walk), walk, step, mixture_version (after the decision), atoms, energy (eV, label), energy_per_atom (eV, label),
-    /// max_force (eV/Å, label). Texts (= !=): element (any atom of the structure), origin (biased, control or imported),
+    /// structure, original mixture), relative_volume (V/V₀), kinetic_temperature (of the structure, K), temperature (K), tau and
+    /// version (of the potential; all of the walk), walk, step, mixture_version (after the decision), atoms, energy (eV, label),
+    /// energy_per_atom (eV, label), max_force (eV/Å, label). Texts (= !=): element (any atom of the structure), origin (biased, control or imported),
     /// seed_structure (its name, in quotes if it contains spaces), group (of the walk, see [[walks]]), retry_adjustment (any of
     /// those with which the label was computed after failures, such as other_moments). A comparison with a missing value is false.
     #[arg(long = "where", value_name = "FILTER")]

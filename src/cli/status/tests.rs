@@ -86,6 +86,7 @@ pub fn large() -> Snapshot {
         },
         end_reason: Some(CampaignEnd::Budget { key: "budget.labels".into() }),
         check: Some(crate::wording::reference_check::tests::example()),
+        versions: crate::wording::versions::tests::example(),
         end: ExpectedEnd {
             walks_hours: Some(12.0),
             labels_hours: Some(30.1),

@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use ::upfit::{EpochRecord, TrainingEvent, UpdateProgress};
+use ::upfit::{EpochRecord, SetErrors, TrainingEvent, UpdateProgress};
 
-use super::report::zero_text;
-use crate::output::{Bar, count, print_stderr};
+use super::report::{spread_text, zero_text};
+use crate::output::{Bar, count, log_and_warn, print_stderr};
 
 /// Time between two lines within an epoch.
 const LINE_INTERVAL: Duration = Duration::from_secs(30);
@@ -29,7 +29,7 @@ impl TrainingDisplay {
     /// Shows an event.
     pub fn show(&mut self, event: &TrainingEvent<'_>) {
         match event {
-            TrainingEvent::Begun { resumed, zero, .. } => {
+            TrainingEvent::Begun { resumed, zero, spread, .. } => {
                 if let Some(epochs) = resumed {
                     let (path, epochs) = (self.checkpoint.display(), count(*epochs, "epoch"));
                     self.bar.suspend(|| {
@@ -39,13 +39,17 @@ impl TrainingDisplay {
                 if let Some(text) = zero_text(zero) {
                     self.bar.suspend(|| print_stderr(text));
                 }
+                if let Some(text) = spread_text(spread) {
+                    self.bar.suspend(|| log_and_warn(text));
+                }
             }
             TrainingEvent::Update(progress) => self.show_update(progress),
-            TrainingEvent::Epoch(record) => {
-                tracing::info!("{}", epoch_text(record));
+            TrainingEvent::Epoch { record, seconds_left } => {
+                let text = epoch_text(record, *seconds_left);
+                tracing::info!("{text}");
                 if !self.bar.is_shown() {
                     self.line = Instant::now();
-                    print_stderr(epoch_text(record));
+                    print_stderr(text);
                 }
             }
         }
@@ -62,31 +66,98 @@ impl TrainingDisplay {
 }
 
 fn update_text(progress: &UpdateProgress) -> String {
-    let left = Duration::from_secs_f64(progress.seconds_left.clamp(0.0, 1e10));
     format!(
-        "epoch {} of {}: loss {:.3e}, {:.1} updates/s, {} left",
+        "epoch {} of {}: loss {:.3e}, {}; learning rate {:.2e}, {:.1} updates/s{}",
         progress.epoch,
         progress.epochs,
         progress.loss,
+        errors_text(&progress.errors),
+        progress.learning_rate,
         progress.updates_per_second,
-        indicatif::HumanDuration(left)
+        left_text(progress.seconds_left)
     )
 }
 
-fn epoch_text(record: &EpochRecord) -> String {
-    let (shown, set) = match &record.errors.validation {
-        Some(errors) => (errors, "validation"),
-        None => (&record.errors.training, "training"),
-    };
+fn epoch_text(record: &EpochRecord, seconds_left: Option<f64>) -> String {
+    let training = &record.errors.training;
+    let validation = record
+        .errors
+        .validation
+        .as_ref()
+        .map(|errors| format!("; validation: loss {:.3e}, {}", errors.loss, errors_text(errors)));
     format!(
-        "epoch {}: loss {:.3e}, {set}: loss {:.3e}, energy {:.2} meV/atom, forces {:.1} meV/Å (RMSE); learning rate {:.2e}, {:.1} \
-         updates/s",
+        "epoch {}: loss {:.3e}, {}{}; learning rate {:.2e}, {:.1} updates/s{}",
         record.epoch,
-        record.errors.training.loss,
-        shown.loss,
-        1e3 * shown.energy_rmse,
-        1e3 * shown.force_rmse,
+        training.loss,
+        errors_text(training),
+        validation.unwrap_or_default(),
         record.learning_rate,
-        record.updates_per_second
+        record.updates_per_second,
+        left_text(seconds_left)
     )
+}
+
+/// Mean absolute errors. Without labelled stresses, there is none of them.
+fn errors_text(errors: &SetErrors) -> String {
+    let stress = errors.stress_mae.map(|stress| format!(", {stress:.2e} eV/Å³")).unwrap_or_default();
+    format!("MAE {:.2e} eV/atom, {:.2e} eV/Å{stress}", errors.energy_mae, errors.force_mae)
+}
+
+fn left_text(seconds: Option<f64>) -> String {
+    let left = seconds.map(|seconds| Duration::from_secs_f64(seconds.clamp(0.0, 1e10)));
+    left.map(|left| format!(", {} left", indicatif::HumanDuration(left))).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use ::upfit::ErrorsBySet;
+
+    use super::*;
+
+    #[test]
+    fn lines_have_errors_with_their_units_and_the_expected_end() {
+        let errors = SetErrors {
+            structures: 3,
+            loss: 0.25,
+            energy_mae: 0.002,
+            energy_rmse: 0.3,
+            force_mae: 0.04,
+            force_rmse: 0.3,
+            stress_mae: Some(5e-4),
+            stress_rmse: Some(0.3),
+        };
+        let progress = UpdateProgress {
+            epoch: 2,
+            epochs: 10,
+            updates: 7,
+            all_updates: 40,
+            updates_per_second: 1.5,
+            seconds_left: Some(180.0),
+            learning_rate: 1e-3,
+            loss: 0.5,
+            errors,
+        };
+        let maes = "MAE 2.00e-3 eV/atom, 4.00e-2 eV/Å, 5.00e-4 eV/Å³";
+        assert_eq!(
+            update_text(&progress),
+            format!(
+                "epoch 2 of 10: loss 5.000e-1, {maes}; learning rate 1.00e-3, 1.5 updates/s, 3 minutes left"
+            )
+        );
+        let without = SetErrors { stress_mae: None, ..errors };
+        let record = EpochRecord {
+            epoch: 1,
+            stage: 0,
+            learning_rate: 1e-3,
+            errors: ErrorsBySet { training: errors, validation: Some(without) },
+            updates_per_second: 1.5,
+        };
+        assert_eq!(
+            epoch_text(&record, None),
+            format!(
+                "epoch 1: loss 2.500e-1, {maes}; validation: loss 2.500e-1, MAE 2.00e-3 eV/atom, 4.00e-2 eV/Å; learning rate \
+                 1.00e-3, 1.5 updates/s"
+            )
+        );
+    }
 }

@@ -6,9 +6,8 @@ use serde_json::{Value, json};
 use store::{Location, VersionRecord, VersionState};
 
 use super::errors::{RecordedErrors, errors_of};
-use super::{CommandError, ExitStatus};
+use super::{CommandError, ExitStatus, KnownVersions};
 use crate::output::{TextTable, decimals, print, print_json};
-use crate::refit::schedule::RefitSchedule;
 use crate::wording::cost::wall_time;
 use crate::wording::date;
 
@@ -29,33 +28,33 @@ const TITLES: [&str; 10] = [
 
 /// Lists the versions.
 pub fn run(location: &Location, json: bool) -> Result<ExitStatus, CommandError> {
-    let schedule = super::read(location, async |store| super::schedule(store).await)?;
+    let known = super::read(location, async |store| KnownVersions::read(store).await)?;
     if json {
-        print_json(&to_json(&schedule))?;
+        print_json(&to_json(&known))?;
     } else {
-        print(|out| write(out, &schedule))?;
+        print(|out| write(out, &known))?;
     }
     Ok(ExitStatus::Done)
 }
 
 /// Mean absolute errors of the forces of a version, eV/Å: on labels held out, and on the replay data.
-fn force_errors(schedule: &RefitSchedule, number: u32) -> [Option<f64>; 2] {
-    let errors = errors_of(&schedule.versions, number);
+fn force_errors(known: &KnownVersions, number: u32) -> [Option<f64>; 2] {
+    let errors = errors_of(&known.versions, number);
     ["held_out", "seed"]
         .map(|kind| errors.iter().find(|found| found.kind == kind).and_then(RecordedErrors::force_mae))
 }
 
-fn write(out: &mut dyn Write, schedule: &RefitSchedule) -> io::Result<()> {
+fn write(out: &mut dyn Write, known: &KnownVersions) -> io::Result<()> {
     let mut table = TextTable::new(&TITLES);
     let none = || "–".to_owned();
     let mut push = |number: u32, columns: [String; 6]| {
-        let mut row = vec![number.to_string(), super::state(schedule, number)];
+        let mut row = vec![number.to_string(), known.state(number)];
         row.extend(columns);
-        row.extend(force_errors(schedule, number).map(|error| decimals(error, 4)));
+        row.extend(force_errors(known, number).map(|error| decimals(error, 4)));
         table.push(row);
     };
     push(0, [none(), CONFIGURATION.to_owned(), none(), none(), none(), none()]);
-    for version in &schedule.versions {
+    for version in &known.versions {
         let VersionRecord { number, parent, method, labels, seconds, core_hours, time, .. } = version;
         let columns = [
             parent.to_string(),
@@ -68,24 +67,27 @@ fn write(out: &mut dyn Write, schedule: &RefitSchedule) -> io::Result<()> {
         push(*number, columns);
     }
     table.write(out)?;
-    for version in schedule.versions.iter().filter(|version| version.state == VersionState::Refused) {
+    for version in known.versions.iter().filter(|version| version.state == VersionState::Refused) {
         writeln!(out, "version {} was refused: {}", version.number, version.reason)?;
     }
-    match super::pending(schedule) {
-        Some(number) => writeln!(out, "version {number} is not taken up yet: calmwalk run does so"),
+    match known.not_taken_up() {
+        Some(number) => writeln!(
+            out,
+            "no walk runs with version {number} yet: calmwalk run takes it up, unless the campaign ends with it"
+        ),
         None => Ok(()),
     }
 }
 
-fn to_json(schedule: &RefitSchedule) -> Value {
+fn to_json(known: &KnownVersions) -> Value {
     let mut versions = vec![first_to_json()];
-    versions.extend(schedule.versions.iter().map(record_to_json));
+    versions.extend(known.versions.iter().map(record_to_json));
     for (number, version) in (0..).zip(&mut versions) {
-        let [held_out, seed] = force_errors(schedule, number);
-        version["in_force"] = json!(number == schedule.taken_up);
+        let [held_out, seed] = force_errors(known, number);
+        version["in_force"] = json!(number == known.taken_up);
         version["force_mae"] = json!({ "held_out": held_out, "seed": seed });
     }
-    json!({ "in_force": schedule.taken_up, "not_taken_up": super::pending(schedule), "versions": versions })
+    json!({ "in_force": known.taken_up, "not_taken_up": known.not_taken_up(), "versions": versions })
 }
 
 /// Version 0 as JSON, with the keys of [`record_to_json`].

@@ -8,11 +8,10 @@ mod list;
 mod roll_back;
 mod show;
 
+use orchestrator::selector::VERSION;
 use store::{Location, Store, VersionRecord, VersionState};
 
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
-use crate::config::StopSection;
-use crate::refit::schedule::RefitSchedule;
 
 /// List the versions of a campaign's potential, compare or export them, or go back to one
 ///
@@ -65,9 +64,45 @@ fn read<T>(
     })?
 }
 
-/// All versions, and the one that the decision log has taken up.
-async fn schedule(store: &Store) -> Result<RefitSchedule, CommandError> {
-    Ok(RefitSchedule::read(store, &StopSection::default()).await?)
+/// The versions of a campaign.
+struct KnownVersions {
+    /// Those from 1 on and refused attempts, by number.
+    versions: Vec<VersionRecord>,
+    /// Number of the version that the decision log has taken up.
+    taken_up: u32,
+}
+
+impl KnownVersions {
+    async fn read(store: &Store) -> Result<Self, CommandError> {
+        let values = store.values().await?;
+        let taken_up = values.iter().find(|(name, _)| name == VERSION);
+        let taken_up = taken_up.and_then(|(_, number)| number.parse().ok()).unwrap_or(0);
+        Ok(Self { versions: store.versions().await?, taken_up })
+    }
+
+    /// The newest registered version; `None` for that of the configuration.
+    fn newest(&self) -> Option<&VersionRecord> {
+        self.versions.iter().rfind(|version| version.state == VersionState::Registered)
+    }
+
+    /// The newest version, if no walk runs with it.
+    fn not_taken_up(&self) -> Option<u32> {
+        self.newest().map(|newest| newest.number).filter(|newest| *newest > self.taken_up)
+    }
+
+    /// State of a version in words; version 0 is always registered.
+    fn state(&self, number: u32) -> String {
+        let found = self.versions.iter().find(|version| version.number == number);
+        let state = found.map_or(VersionState::Registered, |version| version.state);
+        let remark = if number == self.taken_up {
+            ", in force"
+        } else if self.not_taken_up() == Some(number) {
+            ", not taken up"
+        } else {
+            ""
+        };
+        format!("{}{remark}", state.name())
+    }
 }
 
 /// The version or refused attempt with this number, from 1.
@@ -97,23 +132,4 @@ fn registered(versions: &[VersionRecord], number: u32) -> Result<&VersionRecord,
             found.reason
         ))),
     }
-}
-
-/// State of a version in words; version 0 is always registered.
-fn state(schedule: &RefitSchedule, number: u32) -> String {
-    let found = schedule.versions.iter().find(|version| version.number == number);
-    let state = found.map_or(VersionState::Registered, |version| version.state);
-    let remark = if number == schedule.taken_up {
-        ", in force"
-    } else if pending(schedule) == Some(number) {
-        ", not taken up yet"
-    } else {
-        ""
-    };
-    format!("{}{remark}", state.name())
-}
-
-/// The newest version, if the decision log has not taken it up.
-fn pending(schedule: &RefitSchedule) -> Option<u32> {
-    schedule.newest().map(|newest| newest.number).filter(|newest| *newest > schedule.taken_up)
 }

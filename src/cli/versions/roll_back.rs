@@ -15,10 +15,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::errors::figures_of_same_model;
 use super::files::VersionSource;
-use super::{CommandError, ExitStatus, block_on, registered};
+use super::{CommandError, ExitStatus, KnownVersions, block_on, registered};
 use crate::mixture_files::open;
 use crate::output::{count, print, print_json, warn_if_unencrypted};
-use crate::refit::schedule::RefitSchedule;
 use crate::replay::RelocatedFilesArgs;
 use crate::signals::stop_token;
 use crate::unlabelled_updates;
@@ -105,9 +104,9 @@ impl VersionsRollBackArgs {
             CampaignMode::Reproducible => Some(CampaignLock::acquire_at(location, HOLDER).await?),
             CampaignMode::Live => None,
         };
-        let schedule = super::schedule(store).await?;
-        refuse_newest(&schedule, number)?;
-        let versions = &schedule.versions;
+        let known = KnownVersions::read(store).await?;
+        refuse_newest(&known, number)?;
+        let versions = &known.versions;
         let source = (number > 0).then(|| registered(versions, number)).transpose()?;
         let last_decision = source.map_or(0, |source| source.last_decision);
         let files = VersionSource::find(store, number, &self.moved).await?;
@@ -138,12 +137,12 @@ impl VersionsRollBackArgs {
 }
 
 /// Refuses to go back to the newest version, or to one that it is already.
-fn refuse_newest(schedule: &RefitSchedule, number: u32) -> Result<(), CommandError> {
-    let newest = schedule.newest();
+fn refuse_newest(known: &KnownVersions, number: u32) -> Result<(), CommandError> {
+    let newest = known.newest();
     let current = newest.map_or(0, |newest| newest.number);
     if current == number {
         return Err(CommandError::Input(format!(
-            "version {number} is the newest one, with which walks run: expected an earlier version"
+            "version {number} is the newest one already: expected an earlier version"
         )));
     }
     let is_same =
@@ -169,9 +168,9 @@ async fn mixture(
         return Ok(Some((read(path)?, Updates::default())));
     }
     let (model, original) = (files.model_files()?.load()?, files.artifact()?);
-    let known = (1..=after).collect();
+    let covered = (1..=after).collect();
     let found =
-        unlabelled_updates::apply_others(store, &model, original.mixture.clone(), &known, stop).await?;
+        unlabelled_updates::apply_others(store, &model, original.mixture.clone(), &covered, stop).await?;
     let Some(found) = found else { return Ok(None) };
     let updates = Updates { applied: found.applied, covered: found.covered, left_out: found.left_out };
     if updates.applied == 0 {

@@ -9,9 +9,8 @@ use store::{Location, Store, VersionRecord};
 
 use super::errors::{UNKNOWN, table, with_parent};
 use super::list::{first_to_json, record_to_json};
-use super::{CommandError, ExitStatus};
+use super::{CommandError, ExitStatus, KnownVersions};
 use crate::output::{TextTable, count, decimals, print, print_json};
-use crate::refit::schedule::RefitSchedule;
 use crate::replay::{ARTIFACT, MODEL, resolved};
 use crate::wording::cost::wall_time;
 use crate::wording::date;
@@ -30,7 +29,7 @@ pub struct VersionsShowArgs {
 /// What is shown.
 struct ShownVersion {
     number: u32,
-    schedule: RefitSchedule,
+    known: KnownVersions,
     /// BLAKE3 hashes of model and mixture; empty if it has none.
     hashes: [String; 2],
     finds: VersionFinds,
@@ -50,7 +49,7 @@ impl VersionsShowArgs {
 
 impl ShownVersion {
     async fn read(store: &Store, number: u32) -> Result<Self, CommandError> {
-        let schedule = super::schedule(store).await?;
+        let known = KnownVersions::read(store).await?;
         let hashes = match number {
             0 => {
                 let configuration = resolved(&store.campaign().await?)?;
@@ -58,16 +57,16 @@ impl ShownVersion {
                     .map(|key| configuration["files"][key].as_str().unwrap_or_default().to_owned())
             }
             number => {
-                let record = super::numbered(&schedule.versions, number)?;
+                let record = super::numbered(&known.versions, number)?;
                 [record.model_hash.clone(), record.mixture_hash.clone()]
             }
         };
-        Ok(Self { number, schedule, hashes, finds: VersionFinds::read(store, number).await? })
+        Ok(Self { number, known, hashes, finds: VersionFinds::read(store, number).await? })
     }
 
     /// `None` for version 0.
     fn record(&self) -> Option<&VersionRecord> {
-        self.schedule.versions.iter().find(|version| version.number == self.number)
+        self.known.versions.iter().find(|version| version.number == self.number)
     }
 
     fn figures(&self) -> &Value {
@@ -77,7 +76,7 @@ impl ShownVersion {
     fn to_json(&self) -> Value {
         let mut json = self.record().map_or_else(first_to_json, record_to_json);
         let [model, mixture] = self.hashes.each_ref().map(|hash| json!(hash));
-        json["in_force"] = json!(self.number == self.schedule.taken_up);
+        json["in_force"] = json!(self.number == self.known.taken_up);
         (json["model_hash"], json["mixture_hash"]) = (model, mixture);
         json["figures"] = self.figures().clone();
         json["found"] = json!(self.finds);
@@ -85,7 +84,7 @@ impl ShownVersion {
     }
 
     fn write(&self, out: &mut dyn Write) -> io::Result<()> {
-        writeln!(out, "version {}: {}", self.number, super::state(&self.schedule, self.number))?;
+        writeln!(out, "version {}: {}", self.number, self.known.state(self.number))?;
         if let Some(record) = self.record() {
             write_training(out, record)?;
         }
@@ -95,7 +94,7 @@ impl ShownVersion {
             line(out, title, &format!("BLAKE3 {hash}"))?;
         }
         self.write_finds(out)?;
-        let pairs = with_parent(&self.schedule.versions, self.number);
+        let pairs = with_parent(&self.known.versions, self.number);
         if !pairs.is_empty() {
             writeln!(out)?;
             table(["parent", &format!("version {}", self.number)], &pairs).write(out)?;

@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 use std::env;
 
+use monitor::versions::CampaignVersions;
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::style::{Color, Modifier, Style};
@@ -18,8 +19,9 @@ use crate::cli::status as cli_status;
 use crate::cli::status::page::cut;
 use crate::cli::status::walks;
 use crate::output::{self, TextTable, count, decimals};
+use crate::wording::versions;
 
-/// Height of the header with the line below it.
+/// Height of the header, without the line about versions of the potential.
 const HEADER_HEIGHT: u16 = 5;
 /// Height of a chart: title, two lines of bars, axis.
 const CHART_HEIGHT: u16 = 4;
@@ -78,8 +80,10 @@ fn draw_panes(frame: &mut Frame<'_>, area: Rect, state: &mut WatchState, theme: 
     if area.height < MIN_HEIGHT_FOR_PANES {
         return draw_pane(frame, area, state, state.focus, theme);
     }
-    let [head, body] = Layout::vertical([Constraint::Length(HEADER_HEIGHT), Constraint::Fill(1)]).areas(area);
-    draw_head(frame, head, state);
+    let versions = describe_versions(&state.snapshot.versions);
+    let height = HEADER_HEIGHT + u16::from(versions.is_some());
+    let [head, body] = Layout::vertical([Constraint::Length(height), Constraint::Fill(1)]).areas(area);
+    draw_head(frame, head, state, versions);
     let charts = if area.height < MIN_HEIGHT_FOR_CHARTS { 0 } else { CHART_HEIGHT };
     let share = |pane: usize| Constraint::Fill(if pane == state.focus { 3 } else { 2 });
     if area.width < TWO_COLUMN_WIDTH {
@@ -99,7 +103,16 @@ fn draw_panes(frame: &mut Frame<'_>, area: Rect, state: &mut WatchState, theme: 
     draw_charts(frame, charts, state, theme);
 }
 
-fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &WatchState) {
+/// The version in force and the refit under way; `None` in a campaign that has never begun to train one.
+fn describe_versions(found: &CampaignVersions) -> Option<String> {
+    let in_force = found.in_force().map(|version| versions::in_force(found, version));
+    let refit = found.refit.as_ref().map(versions::refit);
+    let parts: Vec<_> = refit.into_iter().chain(in_force).collect();
+    (!parts.is_empty()).then(|| parts.join("; "))
+}
+
+/// `versions`: a line about the versions of the potential.
+fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &WatchState, versions: Option<String>) {
     let (campaign, status) = (&state.snapshot.campaign, &state.snapshot.status);
     let under_way = status.walks.iter().filter(|walk| walk.is_active()).count();
     let paused = status.walks.iter().filter(|walk| walk.paused).count();
@@ -136,12 +149,13 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &WatchState) {
         ),
         ("end", cli_status::end(&state.snapshot).unwrap_or_else(|| "–".into())),
     ];
+    let lines = lines.into_iter().chain(versions.map(|text| ("potential", text)));
     let bold = Modifier::BOLD;
     let lines = lines.map(|(title, text)| {
         let text = cut(&text, usize::from(area.width).saturating_sub(12));
         Line::from(vec![Span::styled(format!("{title:<12}"), bold), Span::raw(text)])
     });
-    frame.render_widget(Paragraph::new(lines.to_vec()), area);
+    frame.render_widget(Paragraph::new(lines.collect::<Vec<_>>()), area);
 }
 
 fn draw_pane(frame: &mut Frame<'_>, area: Rect, state: &mut WatchState, index: usize, theme: &Theme) {

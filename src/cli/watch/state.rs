@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use monitor::Snapshot;
-use store::{QueueEntry, RecentDecision};
+use store::{QueueEntry, RecentDecision, WalkVersions};
 
 use super::charts::Charts;
 use super::entries;
@@ -170,7 +170,13 @@ impl WatchState {
             .set_entries(entries::job_entries(&self.jobs, walks, of_queue.filter.as_ref()), self.jobs.len());
         let decisions = entries::decision_entries(self.decisions.iter(), walks, of_decisions.filter.as_ref());
         of_decisions.set_entries(decisions, self.decisions.len());
-        self.charts = Charts::from_decisions(self.decisions.iter());
+        let version = |walk: &store::WalkStatus| walk.conditions.as_ref().map_or(0, |found| found.version);
+        let versions = WalkVersions::from_walks(walks.iter().map(|walk| (walk.walk, version(walk))));
+        let is_newest = |decision: &&RecentDecision| {
+            decision.walk.is_none_or(|walk| versions.of(walk) == versions.newest())
+        };
+        // γ of different versions of the potential cannot be compared.
+        self.charts = Charts::from_decisions(self.decisions.iter().filter(is_newest));
     }
 
     /// The pane that receives the keys.

@@ -127,6 +127,7 @@ fn all_panes_fit_a_small_terminal() {
         "γ_max of 100: median 1.51, max 2.0",
         "accepted: 25 % of the last 100",
         "expected within 30 h",
+        "training version 4: epoch 12 of 50; version 3 in force",
         "p pause",
     ] {
         assert!(text.contains(words), "{words}:\n{text}");

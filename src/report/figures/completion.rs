@@ -30,9 +30,10 @@ pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
         "Share of labelled structures among those that were labelled or failed for good, by (a) their largest γ under the original \
          mixture and (b) their volume relative to that of the seed structure. Bars, 95 % intervals (Wilson); above the axis, the number \
          of structures in the bin. {} structures are labelled and {} failed, frames of control walks included. Force errors do not \
-         include failed structures.",
+         include failed structures.{}",
         grouped(labelled),
-        grouped(failed)
+        grouped(failed),
+        data.collections.of_version()
     );
     Ok(FigureContent { figure, caption, numbers })
 }

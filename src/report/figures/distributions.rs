@@ -78,15 +78,16 @@ fn caption(collections: &Collections, shown: &[Origin]) -> String {
             origin.name(),
             grouped(collection.structures.total()),
             grouped(atoms.total()),
-            grouped(collection.labelled()),
+            grouped(collection.labelled_of_version),
         )
     };
     let both: Vec<_> = shown.iter().map(of).collect();
     format!(
         "Atoms of all collected structures, under the original mixture. a, Grade γ. b, Its average over the neighbourhood, \
          γ_{{nbr}}. c, Force error |F_{{model}} − F_{{label}}| of the atoms of labelled structures. Dashed, the calibrated \
-         threshold 1. Bins have equal widths on the logarithmic axis; axes omit 0.1 % of the atoms at either end. {}.{}",
+         threshold 1. Bins have equal widths on the logarithmic axis; axes omit 0.1 % of the atoms at either end. {}.{}{}",
         both.join("; "),
-        collections.left_out()
+        collections.left_out(),
+        collections.of_version()
     )
 }

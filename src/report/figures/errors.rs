@@ -210,7 +210,8 @@ fn caption(collections: &Collections, shown: &[Origin]) -> String {
          against the distance of an atom to its nearest neighbour relative to the shortest distance in the seed structure of its walk; \
          atoms without a neighbour within twice that distance are omitted. Lines, medians; bands, P_{{25}}–P_{{75}} and \
          P_{{10}}–P_{{90}}, in equally wide bins with at least {MIN_ATOMS} atoms. Margins, Gaussian kernel densities on the axes as \
-         drawn, each with area 1. Dashed, γ_{{nbr}} = 1 and the distance in the seed structure. {}.",
-        both.join("; ")
+         drawn, each with area 1. Dashed, γ_{{nbr}} = 1 and the distance in the seed structure. {}.{}",
+        both.join("; "),
+        collections.of_version()
     )
 }

@@ -71,8 +71,9 @@ pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
         "Force error |F_{{model}} − F_{{label}}| of all labelled atoms, of biased and control walks together, against (a) the grade γ and \
          (b) its average over the neighbourhood, γ_{{nbr}}, both under the original mixture. Black, medians; bands, P_{{25}}–P_{{75}}, \
          P_{{10}}–P_{{90}} and P_{{5}}–P_{{95}}, in bins of equal width on the logarithmic axis with at least {MIN_ATOMS} atoms. Dashed \
-         grey, the calibrated threshold 1. {}.",
-        correlations.join("; ")
+         grey, the calibrated threshold 1. {}.{}",
+        correlations.join("; "),
+        collections.of_version()
     );
     Ok(FigureContent { figure, caption, numbers })
 }

@@ -8,6 +8,7 @@ mod errors;
 mod grades;
 mod projection;
 mod space;
+mod versions;
 
 use ::figures::{Axis, AxisScale, Panel};
 use analysis::Histogram;
@@ -22,7 +23,7 @@ use crate::page::style::row;
 /// All figures, in the order of the page.
 pub fn all(data: &ReportData) -> Vec<FigureEntry> {
     let part = |name, title, drawn| FigureEntry { name, title, drawn };
-    vec![
+    let mut all = vec![
         part("collection", "Candidates and accepted structures", collection::draw(data)),
         part("distributions", "Grades and force errors", distributions::draw(&data.collections)),
         part("errors", "Force errors of new and of stretched structures", errors::draw(&data.collections)),
@@ -31,7 +32,12 @@ pub fn all(data: &ReportData) -> Vec<FigureEntry> {
         part("grades", "Force errors by grade", grades::draw(&data.collections)),
         part("cost", "Cost of labels", cost::draw(data)),
         part("completion", "Labelled share of structures", completion::draw(data)),
-    ]
+    ];
+    if !data.versions.all.is_empty() {
+        all.push(part("errors-by-labels", "Force errors by number of labels", versions::by_labels(data)));
+        all.push(part("errors-by-cost", "Force errors by cost", versions::by_core_hours(data)));
+    }
+    all
 }
 
 /// Draws histograms of either origin as shares in percent.

@@ -151,8 +151,9 @@ fn caption(collections: &Collections, planes: &[Plane]) -> String {
          each element; in brackets, the share of the variance. Lines enclose the smallest regions with 95 % of the atoms of either \
          collection, by a Gaussian kernel density with Scott’s bandwidth. Large marks are means of structures, small ones atoms \
          ({MAX_DRAWN} of either collection at most). From {} structures evenly spread over the \
-         decision log: {}.",
+         decision log: {}.{}",
         if planes.is_empty() { "no" } else { "up to 256 biased and 256 control" },
-        all.join("; ")
+        all.join("; "),
+        collections.of_version()
     )
 }

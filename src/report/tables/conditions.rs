@@ -10,7 +10,7 @@ use super::{PageTable, count, real, states, text};
 
 /// The biased walks under the same conditions, from any seed structure. Without rows if all walks have the same.
 pub fn conditions(data: &ReportData) -> PageTable {
-    let titles = [
+    let mut titles = vec![
         "group",
         "T (K)",
         "V/V_{0} from",
@@ -25,13 +25,15 @@ pub fn conditions(data: &ReportData) -> PageTable {
     ];
     let caption = "Results by the conditions of biased walks: temperature of the thermostat, volume ramp and τ at the start; accepted \
                    structures, structures rejected by the guard, and roll-backs to a checkpoint.";
-    let mut table = PageTable::new("conditions", caption, &titles);
     let all = by_conditions(&data.status.walks);
+    let has_versions = all.iter().any(|(conditions, _)| conditions.version > 0);
+    titles.extend(has_versions.then_some("version of the potential"));
+    let mut table = PageTable::new("conditions", caption, &titles);
     for (conditions, walks) in all.iter().filter(|_| all.len() > 1) {
         let sum = |of: fn(&WalkStatus) -> u64| walks.iter().map(|walk| of(walk)).sum::<u64>();
         let (accepted, number) = (sum(|walk| walk.accepted.into()), walks.len() as u64);
         let (from, to) = conditions.volume_ramp.unwrap_or((1.0, 1.0));
-        table.rows.push(vec![
+        let mut row = vec![
             text(&conditions.group),
             real(conditions.temperature, 0),
             real(from, 2),
@@ -43,7 +45,9 @@ pub fn conditions(data: &ReportData) -> PageTable {
             real(accepted as f64 / number as f64, 2),
             count(sum(|walk| walk.rejected.unsigned_abs())),
             count(sum(|walk| walk.rollbacks.into())),
-        ]);
+        ];
+        row.extend(has_versions.then(|| text(conditions.version.to_string())));
+        table.rows.push(row);
     }
     table
 }

@@ -52,6 +52,8 @@ struct CandidatePage {
     scanned: usize,
 }
 
+/// `versions` are those of the potential by row; null in a campaign whose walks all have version 0.
+///
 /// `GET /api/candidates?order=…&ascending=…&fate=…&state=…&where=…&after=…&limit=…`
 pub async fn page(State(dashboard): State<Dashboard>, RawQuery(query): RawQuery) -> ApiResult {
     let query = CandidateQuery::parse(query.as_deref().unwrap_or_default())?;
@@ -61,7 +63,12 @@ pub async fn page(State(dashboard): State<Dashboard>, RawQuery(query): RawQuery)
         Some(state) => Some(dashboard.store.imported_jobs(state).await?),
         None => None,
     };
-    json(&json!({ "candidates": rows, "next": next, "scanned": scanned, "imported": imported }))
+    let versions = dashboard.store.walk_versions().await?;
+    let of_rows = || rows.iter().map(|row| versions.of(row.walk)).collect::<Vec<_>>();
+    let versions = (!versions.is_single()).then(of_rows);
+    json(&json!({
+        "candidates": rows, "versions": versions, "next": next, "scanned": scanned, "imported": imported,
+    }))
 }
 
 impl CandidateQuery {

@@ -18,6 +18,6 @@ async fn compute(store: Store) -> Result<String, ApiError> {
     let none =
         || ApiError::new(StatusCode::NOT_FOUND, "the campaign has no label protocol, and so no labels");
     let protocol = store.protocol_in_force().await?.ok_or_else(none)?;
-    let statistics = label_statistics::read(&store, protocol.hash).await?;
+    let statistics = label_statistics::read(&store, protocol.hash, None).await?;
     Ok(wording::json::force_errors(&statistics, &protocol).to_string())
 }

@@ -34,6 +34,7 @@ const FILES: &[(&str, &str)] = files![
     "plots.js",
     "structure.js",
     "style.css",
+    "versions.js",
 ];
 
 /// `GET /`

@@ -57,7 +57,7 @@ async function fetchPage(params, after, signal, onProgress, isStale) {
     query.set("limit", LENGTH - found.length);
     if (next) query.set("after", next);
     const page = await fetchJson(`/api/candidates?${query}`, signal);
-    found = found.concat(page.candidates);
+    found = found.concat(page.candidates.map((one, k) => ({ ...one, version: page.versions?.[k] })));
     searched += page.scanned;
     imported = page.imported;
     next = page.next;
@@ -78,7 +78,7 @@ function filters(params, change) {
   return element("form", { class: "filters", role: "search", onsubmit: submit }, choice("fate", "fate", Object.keys(FATES)),
     choice("label", "state", STATES), element("label", {}, "where", where), element("button", {}, "Show"),
     element("details", {}, element("summary", {}, "Syntax"), element("p", {},
-      "gamma, gamma_nbr (original mixture), relative_volume (V/V₀), kinetic_temperature (K), temperature, tau and group of its walk, walk, step, mixture_version (after the decision), atoms, " +
+      "gamma, gamma_nbr (original mixture), relative_volume (V/V₀), kinetic_temperature (K), temperature, tau, version (of the potential) and group of its walk, walk, step, mixture_version (after the decision), atoms, " +
       "energy (eV), energy_per_atom and max_force (eV/Å) of the label, with = != < <= > >=; " +
       "element, origin (biased or control), seed_structure, retry_adjustment with = and !=; and, or, not and parentheses. " +
       "A comparison with a missing value, such as the energy of an unlabelled candidate, is false.")));
@@ -100,8 +100,12 @@ function lines({ candidates, next, imported }, params, change, pages, after, loa
     pages.push(after);
     load(next);
   };
+  // The version of the potential that found a candidate, if there are several: their grades cannot be compared.
+  const hasVersions = candidates.some((one) => one.version != null);
+  const columns = hasVersions ? [...COLUMNS, ["version", true]] : COLUMNS;
   const table = element("table", { class: "candidates" }, element("caption", { class: "unseen" }, "Candidates"),
-    element("thead", {}, element("tr", {}, COLUMNS.map(head))), element("tbody", {}, candidates.map(line)));
+    element("thead", {}, element("tr", {}, columns.map(head))),
+    element("tbody", {}, candidates.map((candidate) => line(candidate, columns))));
   const number = pages.length + 1;
   return [
     element("div", { class: "scrolls", role: "region", tabindex: "0", "aria-label": "Candidates" }, table),
@@ -113,13 +117,13 @@ function lines({ candidates, next, imported }, params, change, pages, after, loa
   ].filter(Boolean);
 }
 
-function line(candidate) {
+function line(candidate, columns) {
   const fate = candidate.origin === "control" ? "control" : candidate.fate;
   const cells = [
     element("a", { href: `#candidate/${encodeURIComponent(candidate.id)}`, title: candidate.id }, shortName(candidate.id)),
     whole(candidate.decision), state(fate), candidate.job_state ? state(candidate.job_state) : "–",
     candidate.priority ?? "–", decimals(candidate.gamma, 2), decimals(candidate.gamma_nbr, 2),
     decimals(candidate.relative_volume, 4), decimals(candidate.temperature, 0, "K"), candidate.seed_structure, candidate.formula,
-    whole(candidate.atoms), candidate.attempts ?? "–"];
-  return element("tr", {}, cells.map((cell, k) => element("td", { class: COLUMNS[k][1] && "number" }, cell)));
+    whole(candidate.atoms), candidate.attempts ?? "–", whole(candidate.version)];
+  return element("tr", {}, columns.map(([, isNumber], k) => element("td", { class: isNumber && "number" }, cells[k])));
 }

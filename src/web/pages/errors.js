@@ -37,7 +37,8 @@ function shown(errors) {
   const { all } = errors;
   if (all.atoms === 0) return [element("p", {}, "No candidate has a label yet.")];
   return [
-    section(`Protocol ${errors.protocol}`, correlations(errors), energies(errors.energy),
+    section(`Protocol ${errors.protocol}${errors.version == null ? "" : `, version ${errors.version} of the potential`}`, correlations(errors),
+      energies(errors.energy), byVersion(errors),
       element("div", { class: "plots" }, figure("γ", all.gamma), figure("γ_nbr", all.gamma_nbr))),
     section("By γ", quantiles("γ", all.gamma, errors.large)), section("By γ_nbr", quantiles("γ_nbr", all.gamma_nbr, errors.large)),
     section("Structures without a label", completion("γ_max", errors.completion_by_gamma), completion("V/V₀", errors.completion_by_relative_volume)),
@@ -53,6 +54,17 @@ function correlations(errors) {
       decimals(gamma.roc_auc, 3), decimals(near.roc_auc, 3)];
   });
   return table("Rank correlations, and the area under the ROC curve", columns, rows);
+}
+
+/** The versions of the potential, each by its own grades; nothing if there is only one. */
+function byVersion({ by_version: versions }) {
+  if (!versions) return "";
+  const columns = [["version", true], ["structures", true], ["atoms", true], ["mean (eV/Å)", true], ["median (eV/Å)", true], ["ρ(γ)", true],
+    ["ρ(γ_nbr)", true], ["ROC-AUC(γ)", true], ["ROC-AUC(γ_nbr)", true]];
+  const rows = versions.map(({ version, structures, atoms, mean_error: mean, median_error: median, gamma, gamma_nbr: near }) => [whole(version),
+    whole(structures), whole(atoms), decimals(mean, 4), decimals(median, 4), decimals(gamma.spearman, 3), decimals(near.spearman, 3),
+    decimals(gamma.roc_auc, 3), decimals(near.roc_auc, 3)]);
+  return table("By version of the potential, each by its own grades", columns, rows);
 }
 
 /** Energy errors without the element offsets, which the note gives; or why there are none. */

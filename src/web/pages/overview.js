@@ -6,6 +6,7 @@ import { element, facts, renew, section, sentence, state, table, words } from ".
 import { bytes, decimals, digits, duration, percent, time, whole } from "./format.js";
 import { overTime } from "./plots.js";
 import { campaignState } from "./campaign_state.js";
+import { versions } from "./versions.js";
 
 export const TITLE = "Overview";
 
@@ -29,6 +30,7 @@ export function show(content, _, signal) {
     tiles.replaceChildren(...summary(status));
     renew(rest,
       earlyEnds(status.ends),
+      versions(status),
       section("Label queue", queue(status)),
       section("Budget and end", budget(status)),
       section("Walks", walks(status, changes && draw)));
@@ -54,6 +56,7 @@ function summary(status) {
   const declined = Object.entries(candidates.declined).filter(([, count]) => count > 0)
     .map(([reason, count]) => `${whole(count)} ${words(reason)}`).join(", ");
   const how = campaignState(status);
+  const inForce = status.versions.find((one) => one.state === "in_force");
   return [
     tile("Campaign", state(how), `${status.campaign.slice(0, 8)}, ${status.mode} mode`,
       status.round > 0 ? `round ${whole(status.round)}` : "", `${bytes(status.disk.bytes)} on disk`),
@@ -69,12 +72,15 @@ function summary(status) {
         labels.excluded > 0 ? `, ${whole(labels.excluded)} excluded` : ""}`,
       labels.lower_states > 0 && `lower states known of ${whole(labels.lower_states)} structures (calmwalk lower-states)`,
       `${whole(status.labels_last_hour)} made in the last hour`),
+    (inForce || status.refit) && tile("Potential", `version ${whole(inForce?.number ?? 0)}`,
+      inForce?.number > 0 && `trained on ${whole(inForce.labels)} labels`,
+      status.refit && `training version ${whole(status.refit.number)}: ${status.refit.remark || words(status.refit.state)}`),
     tile("Mixture", `version ${whole(version)}`,
       training?.atoms ? `training atoms with γ > 1: ${percent(training.share_above_one)}` : "training frames are not monitored",
       ...forgotten(training?.elements ?? []),
       training?.alarm ? element("span", { class: "wrong" }, `forgetting: above ${exceeded(training)}`) : "",
       staleness ? `walkers had the newest version in ${percent(staleness.share_of_newest)} of decisions` : ""),
-  ];
+  ].filter(Boolean);
 }
 
 /** The elements that are forgotten most: by the share of their sampled atoms above 1, and without a sample by the growth of σ². */

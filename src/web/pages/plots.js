@@ -24,7 +24,7 @@ export function overTime(place, signal) {
     const now = status.candidates.seen + status.candidates.control;
     if (now !== seen) {
       seen = now;
-      newest = await fetchJson(`/api/candidates?limit=${NEWEST}`, signal).then((page) => page.candidates).catch(() => newest);
+      newest = await fetchJson(`/api/candidates?limit=${NEWEST}`, signal).then(ofOneVersion).catch(() => newest);
     }
     // Do not replace what has the focus.
     if (!signal.aborted && !place.contains(document.activeElement)) draw();
@@ -61,6 +61,11 @@ function drawn(samples) {
 function axisOfTime(span) {
   const [unit, name] = span > 1.5e8 ? [8.64e7, "d"] : span > 5.4e6 ? [3.6e6, "h"] : span > 9e4 ? [6e4, "min"] : [1e3, "s"];
   return { title: `time before now (${name})`, unit, least: -span / unit, most: 0, ticks: (value) => tick(Math.abs(value)) };
+}
+
+/** The candidates of the newest version of the potential on a page: γ of different versions cannot be compared. */
+function ofOneVersion({ candidates, versions }) {
+  return versions ? candidates.filter((_, k) => versions[k] === versions[0]) : candidates;
 }
 
 function newestCandidates(newest) {

@@ -14,7 +14,7 @@ use crate::error::StoreError;
 use crate::records::{CampaignRecord, Commit, ComponentRecord};
 use crate::tables::{
     attempt_end, candidate_history, exclude, export, job_counts, listing, lower_states, outcomes, queue,
-    queue_admin, recent, status, structures, versions,
+    queue_admin, recent, status, structures, versions, without_label,
 };
 
 /// The store in a directory, and its file.
@@ -82,6 +82,7 @@ async fn frequent_queries_use_indexes() {
         status::ACCEPTED,
         versions::FILE,
         versions::NEXT,
+        without_label::ACCEPTED,
     ] {
         // A page is a result of an index and has a bounded length.
         let plan = plan(&file, sql).await.replace("SCAN CONSTANT ROW", "").replace("SCAN page", "");

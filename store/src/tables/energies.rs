@@ -3,7 +3,7 @@
 use atoms::Species;
 use wire::ContentHash;
 
-use super::protocols;
+use super::{protocols, walk_conditions};
 use crate::Store;
 use crate::database::{from_columns, query};
 use crate::error::{Result, StoreError};
@@ -15,6 +15,7 @@ const ENERGIES: &str =
     FROM label CROSS JOIN job ON job.structure = label.structure AND job.protocol = label.protocol
     CROSS JOIN candidate ON candidate.decision = job.decision
     WHERE label.protocol = $1 AND status = 'label' AND job.state <> 'dropped' AND candidate.energy IS NOT NULL
+    AND candidate.walk >= $3 AND candidate.walk < $4
     ORDER BY label.number DESC LIMIT $2";
 
 struct EnergyRow {
@@ -27,16 +28,18 @@ struct EnergyRow {
 from_columns!(EnergyRow { decision, formula, model, label });
 
 impl Store {
-    /// Energies of the structures most recently labelled under this protocol, at most `limit`, in decision order.
-    /// Leaves out labels dropped or excluded by hand.
+    /// Energies of the structures from walks with this version of the potential that were most recently labelled under this
+    /// protocol, at most `limit`, in decision order. Leaves out labels dropped or excluded by hand.
     pub async fn labelled_energies(
         &self,
         protocol: ContentHash,
+        version: u32,
         limit: u32,
     ) -> Result<Vec<LabelledEnergies>> {
         let mut transaction = self.database.begin_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
-        let rows = query(ENERGIES).bind(protocol).bind(limit);
+        let walks = walk_conditions::versions(&mut transaction).await?.walks_of(version);
+        let rows = query(ENERGIES).bind(protocol).bind(limit).bind(walks.start).bind(walks.end);
         let mut rows: Vec<EnergyRow> = rows.fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         // Decision order makes sums over them independent of when labels arrived.

@@ -35,3 +35,4 @@ pub mod structures;
 pub mod versions;
 mod walk_conditions;
 mod walk_progress;
+pub mod without_label;

@@ -2,6 +2,7 @@
 
 use atoms::Structure;
 
+use super::walk_conditions;
 use crate::Store;
 use crate::checksum::{CANDIDATE, FEATURES, Names, joined};
 use crate::database::{FromRow, SqlRow, query};
@@ -28,6 +29,7 @@ pub(crate) const NEAR: &str = concat!(
           AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
                           AND label.protocol = job.protocol AND status = 'excluded')
           WHERE formula = $1 AND fate = 'accepted' AND energy IS NOT NULL AND candidate.decision <> $2
+          AND candidate.walk >= $6 AND candidate.walk < $7
           ORDER BY abs(energy - $3) LIMIT $5) AS page
     CROSS JOIN candidate ON candidate.decision = place
     CROSS JOIN candidate_data ON candidate_data.decision = place
@@ -36,6 +38,7 @@ pub(crate) const NEAR: &str = concat!(
 
 struct Own {
     decision: i64,
+    walk: u32,
     formula: String,
     energy: Option<f64>,
     features: Option<Vec<u8>>,
@@ -53,6 +56,7 @@ impl FromRow for Own {
         FEATURES.verify(row)?;
         Ok(Self {
             decision: row.get("decision")?,
+            walk: row.get("candidate__walk")?,
             formula: row.get("formula")?,
             energy: row.get("energy")?,
             features: row.get("features")?,
@@ -69,7 +73,8 @@ impl FromRow for Near {
 
 impl Store {
     /// Features of the leased structure, [n × D], and features of labelled structures under the same protocol with
-    /// the same atoms in the same order, among the `limit` nearest in energy. `None` if its own features were not
+    /// the same atoms in the same order, among the `limit` nearest in energy. All are from walks with the same version of the
+    /// potential: features and energies of different versions cannot be compared. `None` if its own features were not
     /// stored, as those of imported structures.
     pub async fn near_duplicates(
         &self,
@@ -81,7 +86,10 @@ impl Store {
         let own: Option<Own> = query(OWN).bind(lease.job).fetch_optional(&mut transaction).await?;
         let Some(own) = own else { return Ok(None) };
         let (Some(energy), Some(features)) = (own.energy, own.features) else { return Ok(None) };
+        let versions = walk_conditions::versions(&mut transaction).await?;
+        let walks = versions.walks_of(versions.of(own.walk));
         let near = query(NEAR).bind(own.formula).bind(own.decision).bind(energy).bind(protocol).bind(limit);
+        let near = near.bind(walks.start).bind(walks.end);
         let near: Vec<Near> = near.fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         let mut others = Vec::new();

@@ -96,6 +96,13 @@ pub(crate) const FINISHED: &str = concat!(
     ORDER BY candidate.decision LIMIT $3"
 );
 
+/// Labels of structures that were not dropped, each counted with the walk that found its structure first.
+const LABELS_BY_WALK: &str = "SELECT candidate.walk, count(*)
+    FROM label CROSS JOIN job ON job.structure = label.structure AND job.protocol = label.protocol
+    CROSS JOIN candidate ON candidate.decision = job.decision
+    WHERE label.protocol = $1 AND status = 'label' AND job.state <> 'dropped'
+    GROUP BY candidate.walk ORDER BY candidate.walk";
+
 /// Minimum duration of a label, whatever the clock says.
 const MIN_MILLISECONDS: i64 = 1;
 
@@ -126,6 +133,15 @@ impl Store {
         };
         let label_core_seconds = seconds("label_core_milliseconds");
         Ok(LabelUsage { core_seconds: seconds("core_milliseconds"), label_core_seconds, cores })
+    }
+
+    /// Number of structures with a label under this protocol, by the walk that found them.
+    pub async fn labels_by_walk(&self, protocol: ContentHash) -> Result<Vec<(u32, u64)>> {
+        let mut transaction = self.database.begin_read().await?;
+        let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
+        let counts = query(LABELS_BY_WALK).bind(protocol).fetch_all(&mut transaction).await?;
+        transaction.commit().await?;
+        Ok(counts)
     }
 
     /// Failures of attempts under this protocol, by class.
@@ -221,6 +237,7 @@ impl FromRow for FinishedCandidate {
         Ok(Self {
             decision: row.get("decision")?,
             candidate: row.get("candidate__id")?,
+            walk: row.get("candidate__walk")?,
             labelled,
             origin: origin(&row.get::<String>("candidate__origin")?)?,
             seed_structure: row.get("seed_name")?,

@@ -79,6 +79,8 @@ impl Store {
         let imported = query("SELECT count(*) FROM import").fetch_one(&mut transaction).await?;
         let processes = processes::all(&mut transaction).await?;
         let run_active = processes.iter().any(ProcessRecord::is_leading);
+        let is_refitting =
+            processes.iter().any(|found| found.kind == ProcessRecord::REFITTER && !found.is_dead());
         let (limits, used) = budget::read(&mut transaction, now).await?;
         let paused = pauses::read(&mut transaction).await?;
         let mut total = TotalThroughput::default();
@@ -101,7 +103,10 @@ impl Store {
             run_active,
             mixture_version,
             round,
-            finished: !walks.is_empty() && !walks.iter().any(WalkStatus::is_active) && no_more_labels,
+            finished: !walks.is_empty()
+                && !walks.iter().any(WalkStatus::is_active)
+                && no_more_labels
+                && !is_refitting,
             budget: BudgetStatus { used_up: used_up(time_used_up, &walks), limits, used },
             labels,
             oldest_lease,

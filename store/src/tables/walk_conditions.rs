@@ -8,6 +8,7 @@ use crate::Store;
 use crate::checksum::{Names, WALK_CONDITIONS};
 use crate::database::{FromRow, SqlRow, Transaction, query};
 use crate::error::{Result, StoreError};
+use crate::versions::WalkVersions;
 
 const TABLE: &str = "walk_conditions";
 
@@ -19,9 +20,23 @@ impl Store {
         transaction.commit().await?;
         Ok(conditions)
     }
+
+    /// The version of the potential of each walk.
+    pub async fn walk_versions(&self) -> Result<WalkVersions> {
+        let mut transaction = self.database.begin_read().await?;
+        let found = versions(&mut transaction).await?;
+        transaction.commit().await?;
+        Ok(found)
+    }
 }
 
-/// The same, within a transaction.
+/// The version of the potential of each walk, within a transaction.
+pub(super) async fn versions(transaction: &mut Transaction) -> Result<WalkVersions> {
+    let conditions = read(transaction).await?;
+    Ok(WalkVersions::from_walks(conditions.iter().map(|(walk, of)| (walk.0, of.version))))
+}
+
+/// The conditions of each walk, within a transaction.
 pub(super) async fn read(transaction: &mut Transaction) -> Result<BTreeMap<WalkId, WalkConditions>> {
     if !transaction.has_table(TABLE).await? {
         return Ok(BTreeMap::new());

@@ -25,6 +25,8 @@ pub(super) struct EnergyReference<'a> {
 #[derive(Debug, Default)]
 pub(super) struct Offsets {
     fitted: Option<EnergyOffsets>,
+    /// The version of the potential whose energies were fitted: another version may have another zero.
+    version: u32,
     /// Labels until the next fit.
     until_refit: usize,
 }
@@ -40,8 +42,12 @@ impl Offsets {
         stop: &CancellationToken,
     ) -> Result<Option<EnergyReference<'_>>, StoreError> {
         let Some(model) = lease.model_energy.filter(|_| result.is_ok()) else { return Ok(None) };
-        if self.until_refit == 0 {
-            self.fitted = retry_until_written(stop, || energy_offsets(store, protocol.hash)).await?.ok();
+        let versions = retry_until_written(stop, || store.walk_versions()).await?;
+        let version = versions.of_candidate(&lease.candidate);
+        if self.until_refit == 0 || self.version != version {
+            self.version = version;
+            self.fitted =
+                retry_until_written(stop, || energy_offsets(store, protocol.hash, version)).await?.ok();
             self.until_refit =
                 self.fitted.as_ref().map_or(0, |fitted| fitted.structures() / REFIT_DIVISOR).max(1);
         }

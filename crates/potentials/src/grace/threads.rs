@@ -39,8 +39,8 @@ impl Threads {
         }
     }
 
-    /// Calls `act` for each item.
-    pub(super) fn for_each<T: Send>(&self, items: &mut [T], act: impl Fn(&mut T) + Sync + Send) {
+    /// Calls `act` once for each item, in any order.
+    pub fn for_each<T: Send>(&self, items: &mut [T], act: impl Fn(&mut T) + Sync + Send) {
         match &self.0 {
             Some(pool) => pool.install(|| items.par_iter_mut().for_each(act)),
             None => items.iter_mut().for_each(act),

@@ -1,8 +1,12 @@
 //! Trainings of the demonstration's model on a few frames of its training data.
 
+use std::sync::atomic::Ordering::Relaxed;
+use std::sync::atomic::{AtomicBool, AtomicUsize};
+
 use super::*;
 use crate::learning_rate::CosineDecay;
 use crate::loss::LossSettings;
+use crate::progress::ErrorsBySet;
 use crate::split::split;
 use crate::test_frames::{aluminium, model, settings, stronger};
 
@@ -11,11 +15,11 @@ fn data() -> TrainingData {
 }
 
 fn train(data: &TrainingData, settings: &UpfitSettings) -> UpfitOutcome {
-    run(model(), data, settings, None, |_| ControlFlow::Continue(())).unwrap().unwrap()
+    run(model(), data, settings, None, &|| false, |_| {}).unwrap().unwrap()
 }
 
 fn failure(data: &TrainingData, settings: &UpfitSettings) -> UpfitError {
-    match run(model(), data, settings, None, |_| ControlFlow::Continue(())) {
+    match run(model(), data, settings, None, &|| false, |_| {}) {
         Err(error) => error,
         Ok(_) => panic!("the training did not fail"),
     }
@@ -47,11 +51,11 @@ fn a_training_that_is_stopped_anywhere_goes_on_to_the_same_bits() {
     let mut stops = 0;
     let outcome = loop {
         // Each process makes one update.
-        let stop = |event: TrainingEvent<'_>| match event {
-            TrainingEvent::Update(_) => ControlFlow::Break(()),
-            _ => ControlFlow::Continue(()),
+        let updated = AtomicBool::new(false);
+        let on_event = |event: TrainingEvent<'_>| {
+            updated.fetch_or(matches!(event, TrainingEvent::Update(_)), Relaxed);
         };
-        match run(model(), &data, &settings, Some(&path), stop).unwrap() {
+        match run(model(), &data, &settings, Some(&path), &|| updated.load(Relaxed), on_event).unwrap() {
             None => stops += 1,
             Some(outcome) => break outcome,
         }
@@ -67,13 +71,51 @@ fn a_training_that_is_stopped_anywhere_goes_on_to_the_same_bits() {
         (data.clone(), UpfitSettings { seed: 7, ..settings.clone() }, "its random seed is 42, now it is 7"),
         (split(aluminium(5), 0.2, 1).unwrap(), settings.clone(), "its training set"),
     ] {
-        match run(model(), &data, &settings, Some(&path), |_| ControlFlow::Continue(())) {
+        match run(model(), &data, &settings, Some(&path), &|| false, |_| {}) {
             Err(error @ UpfitError::OtherTraining { .. }) => {
                 assert!(error.to_string().contains(difference), "{error}");
             }
             _ => panic!("a checkpoint of another training was accepted"),
         }
     }
+}
+
+#[test]
+fn a_training_can_stop_before_each_structure_that_it_evaluates() {
+    let (data, settings) = (data(), UpfitSettings { average: Some(0.5), ..settings() });
+    let whole = train(&data, &settings);
+    // Answers that say no: 5 for neighbour lists, twice 5 for structures before and after the zero is moved, one for the first epoch
+    // and two for its updates. Then come the validation, and in the end both sets.
+    for (asked, has_begun) in [(2, false), (7, false), (14, false), (16, true), (18, true), (27, true)] {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("run.upfit");
+        let (answers, mut begun) = (AtomicUsize::new(0), false);
+        let stop = || answers.fetch_add(1, Relaxed) >= asked;
+        let stopped = run(model(), &data, &settings, Some(&path), &stop, |_| begun = true);
+        assert!(matches!(stopped, Ok(None)), "{asked}");
+        assert_eq!((begun, path.exists()), (has_begun, has_begun), "{asked}");
+        let resumed = run(model(), &data, &settings, Some(&path), &|| false, |_| {}).unwrap().unwrap();
+        assert_eq!(resumed.model.weights(), whole.model.weights(), "{asked}");
+        assert_eq!((resumed.epoch, &resumed.after), (whole.epoch, &whole.after), "{asked}");
+    }
+}
+
+#[test]
+fn progress_has_the_errors_of_the_epoch_and_the_expected_end() {
+    let data = data();
+    let (mut updates, mut epochs) = (Vec::new(), Vec::new());
+    let outcome = run(model(), &data, &settings(), None, &|| false, |event| match event {
+        TrainingEvent::Update(progress) => updates.push(progress),
+        TrainingEvent::Epoch { record, seconds_left } => epochs.push((record.errors.training, seconds_left)),
+        TrainingEvent::Begun { .. } => {}
+    });
+    assert!(matches!(outcome, Ok(Some(_))));
+    let structures: Vec<_> = updates.iter().map(|progress| progress.errors.structures).collect();
+    assert_eq!(structures, [2, 4, 2, 4]);
+    // After the last batch, they are those of the epoch.
+    assert_eq!((updates[1].errors, updates[3].errors), (epochs[0].0, epochs[1].0));
+    assert!(updates[0].seconds_left.unwrap() > 0.0 && updates[0].errors.stress_mae.unwrap() > 0.0);
+    assert_eq!((updates[3].seconds_left, epochs[1].1), (Some(0.0), Some(0.0)));
 }
 
 #[test]
@@ -124,12 +166,28 @@ fn broken_labels_are_named() {
 }
 
 #[test]
+fn a_structure_whose_energy_has_another_zero_is_named() {
+    let mut data = TrainingData { training: aluminium(5), validation: Vec::new() };
+    data.training[3].energy += 5.0 * 108.0;
+    let mut named = Vec::new();
+    let one = UpfitSettings { epochs: 1, ..settings() };
+    let outcome = run(model(), &data, &one, None, &|| false, |event| {
+        if let TrainingEvent::Begun { spread, zero, .. } = event {
+            assert!(zero.shifts.is_empty(), "{zero:?}");
+            named = spread.far.iter().map(|far| (far.place.clone(), far.difference.round())).collect();
+        }
+    });
+    assert!(matches!(outcome, Ok(Some(_))));
+    assert_eq!(named, [(data.training[3].place.clone(), 5.0)]);
+}
+
+#[test]
 fn a_loss_that_is_not_finite_keeps_the_last_checkpoint() {
     let data = TrainingData { training: aluminium(2), validation: Vec::new() };
     let wild = UpfitSettings { learning_rate: CosineDecay { first: 1e200, last: 0.0 }, ..settings() };
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("run.upfit");
-    let error = match run(model(), &data, &wild, Some(&path), |_| ControlFlow::Continue(())) {
+    let error = match run(model(), &data, &wild, Some(&path), &|| false, |_| {}) {
         Err(error) => error,
         Ok(_) => panic!("the training did not fail"),
     };
@@ -138,11 +196,12 @@ fn a_loss_that_is_not_finite_keeps_the_last_checkpoint() {
     assert!(message.contains("seed_frames.extxyz:") && !error.is_wrong_input(), "{message}");
     let settings = UpfitSettings { threads: 2, ..wild };
     let mut resumed = None;
-    let stopped = run(model(), &data, &settings, Some(&path), |event| {
+    let begun = AtomicBool::new(false);
+    let stopped = run(model(), &data, &settings, Some(&path), &|| begun.load(Relaxed), |event| {
         if let TrainingEvent::Begun { resumed: epochs, .. } = event {
             resumed = epochs;
         }
-        ControlFlow::Break(())
+        begun.store(true, Relaxed);
     });
     assert!(matches!(stopped, Ok(None)) && resumed.is_some_and(|epochs| epochs <= 1), "{resumed:?}");
 }
@@ -162,12 +221,12 @@ fn any_number_of_epochs_can_be_asked_for() {
     let data = TrainingData { training: aluminium(3), validation: Vec::new() };
     let endless = UpfitSettings { epochs: u64::MAX, ..settings() };
     let mut all = None;
-    let stopped = run(model(), &data, &endless, None, |event| {
+    let updated = AtomicBool::new(false);
+    let stopped = run(model(), &data, &endless, None, &|| updated.load(Relaxed), |event| {
         if let TrainingEvent::Update(progress) = event {
             all = Some(progress.all_updates);
-            return ControlFlow::Break(());
+            updated.store(true, Relaxed);
         }
-        ControlFlow::Continue(())
     });
     assert!(matches!(stopped, Ok(None)));
     assert_eq!(all, Some(u64::MAX));

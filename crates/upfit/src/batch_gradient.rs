@@ -1,18 +1,18 @@
 //! The gradient of one batch, over threads.
 
-use potentials::grace::{GradientWorker, TrainableGrace, WeightSums};
+use potentials::grace::{GradientWorker, Threads, TrainableGrace, WeightSums};
 
 use crate::data::FrameFault;
 use crate::differences::FrameDifferences;
 use crate::error::UpfitError;
 use crate::loss::{BatchCounts, LossWeights, loss_gradient};
-use crate::parallel::for_each;
 use crate::prepared::PreparedFrame;
 
 /// Sums over structures, which all batches use again: a total, and those of the frames that are at work at a time.
 pub struct BatchSums {
     total: WeightSums,
     slots: Vec<BatchSlot>,
+    threads: Threads,
 }
 
 /// One frame of a batch.
@@ -23,11 +23,11 @@ struct BatchSlot {
 }
 
 impl BatchSums {
-    /// For this many threads, at least 1, each of which takes one frame at a time.
-    pub fn new(model: &TrainableGrace, threads: usize) -> Self {
+    /// For these threads, each of which takes one frame at a time, and batches of at most `batch_size` frames.
+    pub fn new(model: &TrainableGrace, threads: Threads, batch_size: usize) -> Self {
         let slot = || BatchSlot { frame: 0, sums: model.sums(), outcome: Ok(FrameDifferences::default()) };
-        let slots = std::iter::repeat_with(slot).take(threads.max(1)).collect();
-        Self { total: model.sums(), slots }
+        let slots = std::iter::repeat_with(slot).take(threads.count().min(batch_size).max(1)).collect();
+        Self { total: model.sums(), slots, threads }
     }
 }
 
@@ -64,7 +64,7 @@ pub fn batch_gradient(
     loss: &BatchLoss,
 ) -> Result<BatchGradient, UpfitError> {
     let counts = BatchCounts::new(batch.iter().map(|&index| frames[index].frame));
-    let BatchSums { total, slots } = sums;
+    let BatchSums { total, slots, threads } = sums;
     total.clear();
     let mut workers: Vec<_> = batch.iter().zip(slots.iter()).map(|_| model.worker()).collect();
     let mut differences = FrameDifferences::default();
@@ -73,16 +73,10 @@ pub fn batch_gradient(
         let slots = &mut slots[..wave.len()];
         slots.iter_mut().zip(wave).for_each(|(slot, &index)| slot.frame = index);
         let mut tasks: Vec<_> = slots.iter_mut().zip(&mut workers).collect();
-        let threads = tasks.len();
-        for_each(
-            &mut tasks,
-            threads,
-            || (),
-            |(), (slot, worker)| {
-                slot.sums.clear();
-                slot.outcome = frame_gradient(worker, &frames[slot.frame], loss, &counts, &mut slot.sums);
-            },
-        );
+        threads.for_each(&mut tasks, |(slot, worker)| {
+            slot.sums.clear();
+            slot.outcome = frame_gradient(worker, &frames[slot.frame], loss, &counts, &mut slot.sums);
+        });
         for slot in slots.iter() {
             let found = slot.outcome.clone().map_err(|fault| frames[slot.frame].frame.wrong(fault))?;
             if !found.is_finite() {
@@ -128,14 +122,14 @@ mod tests {
     #[test]
     fn a_step_against_the_gradient_lowers_the_loss_of_the_batch() {
         let (mut model, frames) = (model(), stronger(3));
-        let prepared = prepare(model.model(), &frames, &mut { usize::MAX }).unwrap();
+        let prepared = prepare(model.model(), &frames, &mut { usize::MAX }, &|| false).unwrap().unwrap();
         let loss = BatchLoss { delta: 0.01, weights: LossSettings::demo().stages[0].weights };
         let found =
             |sums: &mut BatchSums| batch_gradient(&model, &prepared, &[2, 0, 1], sums, &loss).unwrap();
-        let one = found(&mut BatchSums::new(&model, 1));
+        let one = found(&mut BatchSums::new(&model, Threads::default(), 3));
         for threads in [2, 3, 5] {
-            let mut sums = BatchSums::new(&model, threads);
-            assert_eq!(sums.slots.len(), threads);
+            let mut sums = BatchSums::new(&model, Threads::new(threads).unwrap(), 3);
+            assert_eq!(sums.slots.len(), threads.min(3));
             // Sums are used again, and threads change no bit.
             for _ in 0..2 {
                 let other = found(&mut sums);
@@ -150,7 +144,9 @@ mod tests {
         let weights: Vec<_> =
             model.weights().iter().zip(&one.gradient).map(|(weight, g)| weight - step * g).collect();
         model.set_weights(&weights);
-        let after = sum(&evaluate(model.model(), &prepared, 0.01, 1).unwrap()).loss(&loss.weights);
+        let evaluated =
+            evaluate(model.model(), &prepared, 0.01, &Threads::default(), &|| false).unwrap().unwrap();
+        let after = sum(&evaluated).loss(&loss.weights);
         // To first order, the loss falls by a part in 10⁴.
         let fall = (before - after) / before;
         assert!((fall - 1e-4).abs() < 2e-5, "{before} {after} {fall}");

@@ -1,0 +1,114 @@
+//! A training from files to a file: reads the data, trains, and writes model and figure.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use ::upfit::{TrainingData, TrainingEvent, UpfitOutcome, UpfitSettings};
+use figures::to_svg;
+use potentials::grace::TrainableGrace;
+use serde_json::Value;
+use tokio_util::sync::CancellationToken;
+
+use super::figure;
+use super::paths::check_paths;
+use crate::atomic_file::{AtomicFile, cannot_write};
+use crate::cli::CommandError;
+use crate::labelled_frames::{DataFile, check_formats, command_error, read_frames};
+use crate::output::{count, print_stderr};
+use crate::structure_files::StructureFiles;
+use crate::upfit_run::{self, UpfitRun};
+
+/// What to train, with which data, and where results go.
+pub struct FineTuning {
+    /// The GRACE model.
+    pub model: PathBuf,
+    /// Labelled structures.
+    pub data: StructureFiles,
+    /// Structures to validate with. Without them, a share of `data` is held out.
+    pub validation: Option<StructureFiles>,
+    /// That share, 0 up to, not including, 1.
+    pub validation_share: f64,
+    /// How to train.
+    pub settings: UpfitSettings,
+    /// File for the new model.
+    pub output: PathBuf,
+    /// File of the state, which is removed at the end.
+    pub checkpoint: PathBuf,
+    /// File for the learning curves.
+    pub figure: Option<PathBuf>,
+}
+
+/// A training whose model is written.
+pub struct FineTuned {
+    pub outcome: UpfitOutcome,
+    /// Where the weights come from, as it stands in the model.
+    pub note: Value,
+}
+
+/// Trains, from the checkpoint if there is one, and writes the results. Returns `None` if `stop` was cancelled; then the same call
+/// continues.
+///
+/// # Errors
+/// Wrong files, data or settings; a training that fails; a file that cannot be written.
+pub fn fine_tune(
+    request: &FineTuning,
+    stop: &CancellationToken,
+    mut show: impl FnMut(&TrainingEvent<'_>),
+) -> Result<Option<FineTuned>, CommandError> {
+    let settings = &request.settings;
+    check_formats(request.data.paths().chain(request.validation.iter().flat_map(StructureFiles::paths)))?;
+    check_paths(request)?;
+    let model = TrainableGrace::load(&request.model).map_err(CommandError::input)?;
+    let Some((data, files)) = read_data(request, stop)? else { return Ok(None) };
+    let name = request.model.display().to_string();
+    let note = upfit_run::note((&name, &model), &data, &files, settings);
+    let run = UpfitRun {
+        model,
+        data,
+        note: note.clone(),
+        settings: settings.clone(),
+        output: request.output.clone(),
+        checkpoint: request.checkpoint.clone(),
+    };
+    let finish = |outcome: &UpfitOutcome| match &request.figure {
+        Some(path) => write_curves(path, outcome),
+        None => Ok(()),
+    };
+    let outcome = run.run(stop, &mut show, finish, command_error)?;
+    Ok(outcome.map(|outcome| FineTuned { outcome, note }))
+}
+
+/// Both sets, and the files that they come from; `None` if it was asked to stop.
+fn read_data(
+    request: &FineTuning,
+    stop: &CancellationToken,
+) -> Result<Option<(TrainingData, Vec<DataFile>)>, CommandError> {
+    let settings = &request.settings;
+    let Some((frames, mut sources)) = read_frames(&request.data, false, stop)? else { return Ok(None) };
+    let data = match &request.validation {
+        None => ::upfit::split(frames, request.validation_share, settings.seed).map_err(command_error)?,
+        Some(files) => {
+            let Some((validation, others)) = read_frames(files, true, stop)? else { return Ok(None) };
+            sources.extend(others);
+            TrainingData { training: frames, validation }
+        }
+    };
+    if settings.patience.is_some() && data.validation.is_empty() {
+        let message = "--patience: expected a validation set, not --validation-share 0";
+        return Err(CommandError::input(message));
+    }
+    let [training, validation] = [data.training.len(), data.validation.len()];
+    print_stderr(format_args!(
+        "{} to train with, {} for validation",
+        count(training as u64, "structure"),
+        count(validation as u64, "structure")
+    ));
+    Ok(Some((data, sources)))
+}
+
+fn write_curves(path: &Path, outcome: &UpfitOutcome) -> Result<(), CommandError> {
+    let mut file = AtomicFile::create(path)?;
+    let text = to_svg(&figure::learning_curves(&outcome.history));
+    file.write_all(text.as_bytes()).map_err(|error| cannot_write(path, error))?;
+    file.finish()
+}
