@@ -54,6 +54,7 @@ mod status;
 mod triage;
 mod unlabelled_updates;
 mod upfit;
+mod versions;
 mod walk_groups;
 mod wrong_artifacts;
 mod wrong_campaign;

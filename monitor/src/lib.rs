@@ -21,6 +21,7 @@ pub mod mixture_values;
 pub mod provenance;
 pub mod reference_check;
 pub mod snapshot;
+pub mod version_finds;
 pub mod versions;
 pub mod walk_ends;
 

@@ -20,6 +20,7 @@ mod launch;
 mod lower_states;
 mod md;
 mod queue;
+mod refit;
 mod refitter;
 mod relabel;
 mod replay;
@@ -32,6 +33,7 @@ pub mod status;
 mod store;
 mod upfit;
 mod validate;
+mod versions;
 mod walker;
 mod walks;
 mod watch;
@@ -80,6 +82,8 @@ enum CliCommand {
     Export(export::ExportArgs),
     Report(report::ReportArgs),
     Replay(replay::ReplayArgs),
+    Versions(versions::VersionsArgs),
+    Refit(refit::RefitArgs),
     #[command(subcommand)]
     Calm(calm::CalmCommand),
     Select(select::SelectArgs),
@@ -123,6 +127,8 @@ pub fn run(arguments: Arguments) -> Result<ExitStatus, CommandError> {
         CliCommand::Export(command) => command.run(),
         CliCommand::Report(command) => command.run(),
         CliCommand::Replay(command) => command.run(),
+        CliCommand::Versions(command) => command.run(),
+        CliCommand::Refit(command) => command.run(),
         CliCommand::Calm(command) => command.run(),
         CliCommand::Select(command) => command.run(),
         CliCommand::Upfit(command) => command.run(),

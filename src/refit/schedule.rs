@@ -95,7 +95,12 @@ impl RefitSchedule {
 
     /// Whether a refit is due when all walks have ended: there is anything new.
     pub fn is_due_after_walks(&self) -> bool {
-        self.trains_more() && self.accepted > self.accepted_before()
+        self.trains_more() && self.has_news()
+    }
+
+    /// Whether structures were accepted since the last attempt.
+    pub fn has_news(&self) -> bool {
+        self.accepted > self.accepted_before()
     }
 
     /// Whether a refit is due beside the walks of a live campaign, which began at `begin`; both times in ms since 1970.

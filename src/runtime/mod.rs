@@ -11,7 +11,7 @@ pub mod notify;
 mod process_manager;
 mod process_records;
 pub mod reference_check;
-mod refit_process;
+pub mod refit_process;
 pub mod scratch_dir;
 mod single_process;
 mod spawn;

@@ -2,6 +2,7 @@
 
 pub mod budget;
 pub mod cost;
+pub mod date;
 pub mod disk;
 pub mod end_reason;
 pub mod energies;

@@ -27,7 +27,7 @@ pub struct CollectedStructure {
 /// Number of candidates of biased walks with one fate.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FateCount {
-    /// Interval of the decision log or index of the seed structure, from 0.
+    /// Interval of the decision log, index of the seed structure or number of the walk, from 0.
     pub part: u64,
     /// `accepted`, or the reason of the decline.
     pub fate: String,

@@ -242,6 +242,10 @@ async fn collected_structures_come_with_their_labels() {
     assert_eq!(parts, [fate(0, "accepted", 4), fate(1, "accepted", 2), fate(1, "covered", 1)]);
     let seeds = store.fates_by_seed_structure().await.unwrap();
     assert_eq!(seeds, [fate(0, "accepted", 6), fate(0, "covered", 1)]);
+    let other = candidate(3, 11, Origin::Biased, declined);
+    store.commit(&commit_of(vec![other])).await.unwrap();
+    let walks = store.fates_by_walk().await.unwrap();
+    assert_eq!(walks, [fate(0, "accepted", 6), fate(0, "covered", 1), fate(3, "covered", 1)]);
 }
 
 #[tokio::test]

@@ -31,6 +31,9 @@ const BY_SEED_STRUCTURE: &str =
     "SELECT seed_structure AS part, coalesce(reason, fate) AS fate, count(*) AS number
     FROM candidate WHERE origin = 'biased' GROUP BY 1, 2 ORDER BY 1, 2";
 
+const BY_WALK: &str = "SELECT walk AS part, coalesce(reason, fate) AS fate, count(*) AS number
+    FROM candidate WHERE origin = 'biased' GROUP BY 1, 2 ORDER BY 1, 2";
+
 /// No protocol has it.
 const NO_PROTOCOL: i64 = -1;
 
@@ -62,6 +65,11 @@ impl Store {
     /// The same by seed structure.
     pub async fn fates_by_seed_structure(&self) -> Result<Vec<FateCount>> {
         query(BY_SEED_STRUCTURE).fetch_all(&self.database).await
+    }
+
+    /// The same by walk.
+    pub async fn fates_by_walk(&self) -> Result<Vec<FateCount>> {
+        query(BY_WALK).fetch_all(&self.database).await
     }
 }
 
