@@ -189,8 +189,8 @@ fn an_exported_version_has_the_bytes_of_the_store_and_replaces_nothing() {
     assert_eq!(said, "wrote out/1/kokkos.npz\nwrote out/1/gmm_artifacts.npz\nwrote out/lammps.npz\n");
     assert_eq!(fs::read(here.join("out/1/kokkos.npz")).unwrap(), real(MODEL));
     assert_eq!(fs::read(here.join("out/1/gmm_artifacts.npz")).unwrap(), real(MIXTURE));
-    let embedded = Artifact::load_export(&here.join("out/lammps.npz")).unwrap().mixture;
-    let original = Artifact::load(&config(MIXTURE)).unwrap().mixture;
+    let embedded = Artifact::load_export(here.join("out/lammps.npz")).unwrap().mixture;
+    let original = Artifact::load(config(MIXTURE)).unwrap().mixture;
     assert_eq!(embedded.iter().count(), original.iter().count());
 
     fs::remove_file(here.join("out/1/kokkos.npz")).unwrap();

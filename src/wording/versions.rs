@@ -87,11 +87,6 @@ pub fn table(versions: &CampaignVersions) -> String {
     text
 }
 
-/// A change with its sign, in per cent.
-pub fn percent(change: Option<f64>) -> String {
-    change.map_or("–".to_owned(), |change| format!("{:+.0}", 100.0 * change))
-}
-
 #[cfg(test)]
 pub mod tests {
     use monitor::versions::{ComparedErrors, ErrorFigures, VersionStanding};

@@ -212,7 +212,7 @@ pub fn table(names: [&str; 2], pairs: &[ErrorPair<'_>]) -> TextTable {
 }
 
 /// The name of the version with the smaller errors.
-fn better<'a>(names: [&'a str; 2], ratio: Option<f64>) -> &'a str {
+fn better(names: [&str; 2], ratio: Option<f64>) -> &str {
     match ratio {
         Some(ratio) if ratio < 1.0 => names[1],
         Some(ratio) if ratio > 1.0 => names[0],
