@@ -136,7 +136,7 @@ fn read_by_ase(path: &Path, frames: &[Frame]) {
 #[test]
 fn aluminium_runs_as_it_stands() {
     let directory = tempfile::tempdir().unwrap();
-    let frames = campaign(directory.path(), &config("aluminium.toml"), 8, 1.2);
+    let frames = campaign(directory.path(), &config("aluminium.toml"), 24, 1.2);
     let mut potential = Eam::load_as(config("data/Al_mm.eam.fs"), EamStyle::FinnisSinclair).unwrap();
     check_labels(&frames, &mut potential);
 }

@@ -40,7 +40,7 @@ fn written(here: &Path) -> String {
 /// Names of the keys, also of those that are commented out.
 fn keys(text: &str) -> Vec<&str> {
     let is_key = |name: &&str| !name.is_empty() && name.chars().all(|c| c.is_ascii_lowercase() || c == '_');
-    let lines = text.lines().map(|line| line.strip_prefix("# ").unwrap_or(line));
+    let lines = text.lines().map(|line| line.strip_prefix("# ").unwrap_or(line).trim_start());
     lines.filter_map(|line| line.split_once(" = ").map(|(name, _)| name)).filter(is_key).collect()
 }
 

@@ -29,7 +29,7 @@ pub enum CampaignEnd {
         /// Relative fall of the force errors on labels held out for each 100 labels.
         improvement: f64,
     },
-    /// As many versions of the potential are trained as there may be, and all walks of the last one have ended.
+    /// As many versions of the potential are trained as there may be.
     AllVersions {
         /// Their number.
         versions: u64,

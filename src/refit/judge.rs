@@ -233,7 +233,9 @@ pub fn load_version(config: &RefitterConfig, path: &Path) -> Result<GraceModel, 
 
 /// Why a version with these errors is refused, if it is.
 pub fn refusal(settings: &RefitSettings, sets: &[SetFigures]) -> Option<String> {
-    sets.iter().find_map(|set| {
+    // What it has forgotten before what it has not learned.
+    let of_kind = |kind| sets.iter().filter(move |set| set.kind == kind);
+    of_kind(SetKind::Seed).chain(of_kind(SetKind::HeldOut)).find_map(|set| {
         let version = set.version.force_mae;
         let rule = match set.kind {
             SetKind::Seed => Some((

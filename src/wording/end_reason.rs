@@ -23,10 +23,9 @@ pub fn describe(end: &CampaignEnd) -> String {
                 "the held-out force error of version {version} {how} per 100 labels (stop.min_improvement)"
             )
         }
-        CampaignEnd::AllVersions { versions } => format!(
-            "{} of the potential trained (refit.max_versions), and all walks of the last have ended",
-            count(*versions, "version")
-        ),
+        CampaignEnd::AllVersions { versions } => {
+            format!("{} of the potential trained (refit.max_versions)", count(*versions, "version"))
+        }
     }
 }
 
@@ -52,7 +51,7 @@ mod tests {
             ),
             (
                 CampaignEnd::AllVersions { versions: 1 },
-                "1 version of the potential trained (refit.max_versions), and all walks of the last have ended",
+                "1 version of the potential trained (refit.max_versions)",
             ),
         ] {
             assert_eq!(describe(&end), expected);

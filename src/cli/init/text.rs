@@ -80,7 +80,7 @@ pub fn configuration(
     let sections = [potential, calm, seeds, walk, group, collect, guard, label, run];
     let (body, listed) = match campaign.full {
         true => {
-            let template = String::from_utf8_lossy(CAMPAIGN);
+            let template = template();
             let listed = "Every key is listed, but for those of label.method (docs/dft-codes.md). Keys that are commented out show \
                  their defaults,\n# or an example where there is none.";
             (full_text(&template, sections.into()), listed)
@@ -95,6 +95,20 @@ pub fn configuration(
         "{SCHEMA_LINE}# Suggested by `calmwalk init` for this model and these seed structures: change what you know better.\n\
          # {listed}\n# Units: Å, eV, fs, K. Paths are relative to this file.\n\n{body}\n"
     ))
+}
+
+/// The example campaign with every key, but with the section of refits commented out, as in another campaign.
+fn template() -> String {
+    let (example, other) = (String::from_utf8_lossy(CAMPAIGN), include_str!("../../../configs/silicon.toml"));
+    let cut = |text: &str, begin: &str| -> Option<[String; 3]> {
+        let (before, rest) = text.split_once(begin)?;
+        let (section, after) = rest.split_once("\n[budget]")?;
+        Some([before.to_owned(), format!("{begin}{section}"), format!("\n[budget]{after}")])
+    };
+    match (cut(&example, "\n[refit]"), cut(other, "\n# [refit]")) {
+        (Some([before, _, after]), Some([_, section, _])) => [before, section, after].concat(),
+        _ => example.into_owned(),
+    }
 }
 
 /// The sections that name the model, its mixture, and the seed structures.
@@ -234,7 +248,7 @@ fn zbl_value(windows: &ZblWindows) -> String {
 /// The template with these keys in place of its own; its other keys are commented out.
 fn full_text(template: &str, mut sections: Vec<WrittenSection>) -> String {
     // The names of the demo's files are examples.
-    let template = template.replace("data/al_eam_1l/", "").replace("data/", "");
+    let template = template.replace("data/al_eam_1l/", "").replace("data/si_sw_1l/", "").replace("data/", "");
     let template = template.replace("seed_frames.extxyz", "training_frames.extxyz");
     let template = template.replace("schema=aluminium", "schema=campaign");
     let mut take = |is_wanted: &dyn Fn(&str) -> bool| {
