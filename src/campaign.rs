@@ -124,7 +124,7 @@ impl LoadedCampaign {
         for (key, file) in others {
             file_hashes.extend(file.as_ref().map(|file| loader.hash(key, file)).transpose()?);
         }
-        file_hashes.extend(loader.refit_files()?);
+        file_hashes.extend(loader.refit_files(&model)?);
         let path = path.to_owned();
         Ok(Self {
             config,

@@ -212,9 +212,12 @@ async fn run(
     let store = registration::unregister(store, &process, worked.as_ref()).await;
     let outcome = worked?;
     let store = store?;
-    // A refit may be left although every walk has ended.
-    let may_refit = campaign.config.refit.is_some() && outcome == reactor::RunOutcome::Stopped;
-    if may_refit || !store.status().await?.finished {
+    let status = store.status().await?;
+    // A refit may be left although every walk has ended, unless a budget of time allows no further work.
+    let may_refit = campaign.config.refit.is_some()
+        && outcome == reactor::RunOutcome::Stopped
+        && status.budget.used_up.is_none();
+    if may_refit || !status.finished {
         if pauses && MixtureValues(store.values().await?).training_frames()["alarm"] == true {
             return Err(paused_by_alarm(campaign, &store).await?);
         }

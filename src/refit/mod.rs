@@ -16,7 +16,7 @@ pub mod settings;
 mod training_set;
 
 use std::collections::HashSet;
-use std::fs;
+use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 
 use atoms::extxyz::write_frame;
@@ -27,7 +27,7 @@ use store::{Store, VersionFiles, VersionRecord, VersionState, unix_milliseconds}
 use tokio_util::sync::CancellationToken;
 
 pub use self::command::end_marked_when_alone;
-use self::cost::CostMeter;
+use self::cost::{CostMeter, RefitCost};
 use self::failure::RefitFailure;
 use self::judge::{ComparisonFigures, DataSets, EvaluationContext, SetFigures, load_version, refusal};
 use self::native::NativeTraining;
@@ -42,6 +42,8 @@ use crate::structure_files::StructureReadingArgs;
 
 /// Folder of the campaign's directory for refits.
 const FOLDER: &str = "refit";
+/// The file that a refit locks.
+const LOCK: &str = "refit.lock";
 /// The new model and its mixture.
 const MODEL: &str = command::MODEL;
 const MIXTURE: &str = "mixture.npz";
@@ -76,6 +78,7 @@ struct Refit<'a> {
     set: FrozenSet,
     labels: LabelFiles,
     stop: &'a CancellationToken,
+    meter: &'a CostMeter,
     report: &'a (dyn Fn(String) + Sync),
 }
 
@@ -90,18 +93,20 @@ async fn run(
     report: &(dyn Fn(String) + Sync),
 ) -> Result<RefitOutcome, CommandError> {
     check_files(config)?;
+    let _lock = lock(&config.directory)?;
     let versions = store.versions().await?;
     if let Some(ended) = recorded_before(config, store, &versions).await? {
         return Ok(ended);
     }
     let number = 1 + versions.last().map_or(0, |version| version.number);
-    let directory = prepare_directory(&config.directory, number)?;
+    let protocol = store.protocol_in_force().await?.map_or_else(String::new, |found| found.hash.to_string());
+    let directory = prepare_directory(&config.directory, number, &protocol)?;
     let meter = CostMeter::new(&directory);
     let set = kept::<_, CommandError>(directory.join("set.json"), async || {
         // In this order: a structure that is accepted in between counts for the next refit.
         let accepted = store.accepted_structures().await?;
         let last_decision = store.newest_mixture().await?.decision;
-        Ok(Some(FrozenSet { number, last_decision, accepted }))
+        Ok(Some(FrozenSet { number, protocol, last_decision, accepted }))
     });
     let Some(set) = set.await? else { return Ok(RefitOutcome::Stopped) };
     let labels = kept(directory.join("labels.json"), async || {
@@ -116,7 +121,8 @@ async fn run(
         }
         report(format!("refit {number}: {line}"));
     };
-    let refit = Refit { config, store, directory, set, labels, stop, report: &report_numbered };
+    let refit =
+        Refit { config, store, directory, set, labels, stop, meter: &meter, report: &report_numbered };
     let judged = refit.train_and_judge().await;
     meter.save()?;
     let (reason, figures) = match judged {
@@ -125,7 +131,21 @@ async fn run(
         Err(RefitFailure::Refused(reason)) => (Some(reason), Value::Null),
         Err(RefitFailure::Failed(error)) => return Err(error),
     };
-    refit.record(reason, figures, &meter).await
+    refit.record(reason, figures).await
+}
+
+/// Makes this the only refit in the directory of a campaign while the file is open.
+fn lock(campaign: &Path) -> Result<File, CommandError> {
+    let path = campaign.join(LOCK);
+    let file = File::create(&path).map_err(|error| cannot_write(&path, error))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => Err(CommandError::Failed(format!(
+            "another refit of the campaign in {} is running: wait for its end",
+            campaign.display()
+        ))),
+        Err(TryLockError::Error(error)) => Err(cannot_write(&path, error)),
+    }
 }
 
 /// How this refit ended, if an earlier process of it recorded that and was killed then.
@@ -161,10 +181,18 @@ fn check_files(config: &RefitterConfig) -> Result<(), CommandError> {
     files.try_for_each(|file| verify_hash(&file.path, &file.hash))
 }
 
-/// The directory of a refit. Those of earlier ones are removed.
-fn prepare_directory(campaign: &Path, number: u32) -> Result<PathBuf, CommandError> {
+/// The directory of a refit. Those of earlier ones, and of labels of another protocol, are removed.
+fn prepare_directory(campaign: &Path, number: u32, protocol: &str) -> Result<PathBuf, CommandError> {
     let all = campaign.join(FOLDER);
     let directory = all.join(number.to_string());
+    let before: Option<FrozenSet> =
+        fs::read(directory.join("set.json")).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
+    if before.is_some_and(|before| before.protocol != protocol) {
+        log_and_warn(format_args!(
+            "refit {number}: begins again, since the labels have another protocol now"
+        ));
+        fs::remove_dir_all(&directory).map_err(|error| cannot_write(&directory, error))?;
+    }
     fs::create_dir_all(&directory).map_err(|error| cannot_write(&directory, error))?;
     for entry in fs::read_dir(&all).map_err(CommandError::failed)? {
         let path = entry.map_err(CommandError::failed)?.path();
@@ -196,9 +224,20 @@ impl Refit<'_> {
                 Err(failed) => return Err(failed),
             }
         }
+        let figures = |comparisons: Vec<ComparisonFigures>| json!({ "sets": figures, "comparisons": comparisons, "training": training });
+        if reason.is_some() {
+            return Ok(Some((reason, figures(Vec::new()))));
+        }
+        self.version_cost().await?;
         let Some(comparisons) = self.compare_all(&sets).await? else { return Ok(None) };
-        let figures = json!({ "sets": figures, "comparisons": comparisons, "training": training });
-        Ok(Some((reason, figures)))
+        Ok(Some((None, figures(comparisons))))
+    }
+
+    /// The cost when this is first asked for: that of the version, without the models that are trained for comparison.
+    async fn version_cost(&self) -> Result<RefitCost, CommandError> {
+        let cost =
+            kept(self.path("version_cost.json"), async || Ok::<_, CommandError>(Some(self.meter.now())));
+        Ok(cost.await?.unwrap_or_default())
     }
 
     /// The data sets to judge with. `None` if it was stopped.
@@ -353,19 +392,14 @@ impl Refit<'_> {
     }
 
     /// Registers the version, or records why it is refused.
-    async fn record(
-        self,
-        reason: Option<String>,
-        figures: Value,
-        meter: &CostMeter,
-    ) -> Result<RefitOutcome, CommandError> {
+    async fn record(self, reason: Option<String>, figures: Value) -> Result<RefitOutcome, CommandError> {
         let is_refused = reason.is_some();
         let files = if is_refused { None } else { Some(self.read_files()?) };
         let of_file = |name| match is_refused {
             true => Ok(String::new()),
             false => hash(&self.path(name)).map_err(CommandError::failed),
         };
-        let cost = meter.now();
+        let cost = self.version_cost().await?;
         let record = VersionRecord {
             number: self.set.number,
             parent: self.config.parent_version,

@@ -27,6 +27,8 @@ const PAGE: u32 = 200;
 pub struct FrozenSet {
     /// Number of the version to train.
     pub number: u32,
+    /// Hash of the protocol of the labels.
+    pub protocol: String,
     /// The newest decision whose label counts.
     pub last_decision: i64,
     /// Number of structures that biased walks had found until then.

@@ -86,7 +86,7 @@ async fn run_in(
         tokio::try_join!(async { local.await.map_err(CommandError::failed) }, remote).map(|_| ())
     });
     let reactor = start_reactor(run, selector, incoming, stopping);
-    supervise(manager, reactor, no_more_work, serving, run.stop).await
+    supervise(manager, reactor, no_more_work, serving, run).await
 }
 
 /// Distinguishes the walkers of this run from those of any other.
@@ -115,7 +115,7 @@ async fn supervise(
     mut reactor: ReactorTask,
     no_more_work: CancellationToken,
     mut serving: JoinHandle<Result<(), CommandError>>,
-    stop: &CancellationToken,
+    RunContext { stop, superseded, .. }: RunContext<'_>,
 ) -> Result<reactor::RunOutcome, CommandError> {
     let (mut reactor_result, mut transport_result, mut stop_requested) = (None, None, false);
     let mut database_deadline = None;
@@ -139,7 +139,10 @@ async fn supervise(
             ManagerEvent::ReactorEnded(ended) => {
                 no_more_work.cancel();
                 match ended {
-                    Ok(reactor::RunOutcome::Finished) => manager.wait_for_labels(),
+                    // The walks of the newer version do not wait for the labels of those that made room.
+                    Ok(reactor::RunOutcome::Finished) if !superseded.is_cancelled() => {
+                        manager.wait_for_labels();
+                    }
                     _ => manager.stop(),
                 }
                 reactor_result = Some(ended);

@@ -50,7 +50,7 @@ impl<'a> RefitProcess<'a> {
         let config = RefitterConfig { parent: Some(std::process::id()), ..config };
         let limits = Limits {
             heartbeat_timeout: NO_TIMEOUT,
-            max_restarts: self.refit.max_attempts.get(),
+            max_restarts: self.refit.max_attempts.get() - 1,
             ..Limits::default()
         };
         self.children = Some(Children::new(1, limits, move |_, _| {
@@ -70,6 +70,16 @@ impl<'a> RefitProcess<'a> {
             ended = self.finish() => return ended,
             () = stop.cancelled() => {}
         }
+        self.stop().await
+    }
+
+    /// Whether one is running.
+    pub fn is_running(&self) -> bool {
+        self.children.is_some()
+    }
+
+    /// Asks the running refit to end, if there is one, and waits for that. A later one continues it.
+    pub async fn stop(&mut self) -> Result<(), CommandError> {
         if let Some(children) = &mut self.children {
             children.stop();
         }
@@ -129,12 +139,15 @@ impl<'a> RefitProcess<'a> {
     }
 
     async fn check(&mut self) -> Result<(), CommandError> {
-        let RunContext { store, campaign, process, superseded, .. } = self.run;
+        let RunContext { store, campaign, superseded, .. } = self.run;
         let schedule = RefitSchedule::read(store, &campaign.config).await?;
         let newest = schedule.newest().map_or(0, |version| version.number);
         if newest > campaign.version_number() {
             superseded.cancel();
-        } else if schedule.is_due_beside_walks(self.refit, process.started, unix_milliseconds()) {
+        } else if self.children.is_none()
+            && schedule.is_due_beside_walks(self.refit, campaign_begin(store).await?, unix_milliseconds())
+            && !is_another_running(store).await?
+        {
             self.start()?;
         }
         Ok(())
@@ -151,7 +164,8 @@ impl<'a> RefitProcess<'a> {
                     if ended.then != ChildState::Exited {
                         log_and_warn(format_args!("refit: {}; {}", ended.reason, ended.then));
                     }
-                    remove_dead(self.run.store).await?;
+                    // A database that is busy for a moment has the record a little longer.
+                    let _ = remove_dead(self.run.store).await;
                 }
                 ChildEvent::AllExited => {
                     let failed = all_failed_message(children);
@@ -165,6 +179,17 @@ impl<'a> RefitProcess<'a> {
             }
         }
     }
+}
+
+/// When the campaign began, ms since 1970.
+async fn campaign_begin(store: &Store) -> Result<i64, StoreError> {
+    Ok(store.operations(0, 1).await?.first().map_or(0, |created| created.time))
+}
+
+/// Whether the user runs a refit by hand.
+async fn is_another_running(store: &Store) -> Result<bool, StoreError> {
+    let refits = store.processes(Some(ProcessRecord::REFITTER)).await?;
+    Ok(refits.iter().any(|found| !found.is_dead()))
 }
 
 /// Removes the records of refits that have ended without doing so.

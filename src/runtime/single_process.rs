@@ -54,6 +54,8 @@ struct Tasks {
     walkers: Vec<JoinHandle<walker::WalkerExit>>,
     labellers: JoinSet<Result<(), StoreError>>,
     reactor: ReactorTask,
+    /// Cancelled when walks have made room for a newer version of the potential, whose walks do not wait for labels.
+    superseded: CancellationToken,
     /// The store to poll for labels that other processes make, if this one makes none.
     external_labels: Option<Store>,
     closing: Arc<Shutdown>,
@@ -71,7 +73,8 @@ impl Tasks {
         let labellers = start_labellers(run, &closing)?;
         let reactor = start_reactor(run, selector, incoming, stopping.clone());
         let external_labels = labellers.is_empty().then(|| run.store.clone());
-        Ok(Self { walkers, labellers, reactor, external_labels, closing, stopping })
+        let superseded = run.superseded.clone();
+        Ok(Self { walkers, labellers, reactor, superseded, external_labels, closing, stopping })
     }
 
     /// Waits for all of them. A labeller that cannot go on stops the campaign, because its queue could only grow.
@@ -91,9 +94,8 @@ impl Tasks {
             self.stopping.cancel();
             self.closing.stop.cancel();
         }
-        if let Some(store) =
-            self.external_labels.filter(|_| matches!(ended, Ok(reactor::RunOutcome::Finished)))
-        {
+        let waits = matches!(ended, Ok(reactor::RunOutcome::Finished)) && !self.superseded.is_cancelled();
+        if let Some(store) = self.external_labels.filter(|_| waits) {
             self.closing.stop.run_until_cancelled(wait_for_labels(&store)).await.transpose()?;
         }
         let panicked = self.walkers.into_iter().map(JoinHandle::join).filter(Result::is_err).count();

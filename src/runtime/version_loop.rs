@@ -11,6 +11,7 @@ use store::Store;
 use tokio_util::sync::CancellationToken;
 
 use super::refit_process::RefitProcess;
+use super::single_process::write_heartbeats;
 use super::{RunContext, RunMode, STOP_MESSAGE, run_walks};
 use crate::campaign::LoadedCampaign;
 use crate::config::RefitSection;
@@ -70,16 +71,22 @@ async fn run_version(
         error = process.watch() => return Err(error),
     };
     if ended == RunOutcome::Stopped {
+        process.stop().await?;
         return Ok(VersionEnd::Campaign(ended));
     }
     let schedule = RefitSchedule::read(run.store, &run.campaign.config).await?;
     let next = schedule.in_force().map_or(0, |version| version.number);
     let is_newer = next > run.campaign.version_number();
-    if !is_newer && !schedule.is_due_after_walks() {
+    if is_newer {
+        // A version that the user went back to makes the refit beside the walks pointless.
+        process.stop().await?;
+    } else if process.is_running() || schedule.is_due_after_walks() {
+        tokio::select! {
+            ended = process.run_to_end() => ended?,
+            never = write_heartbeats(run.store.clone(), run.process.clone()) => match never {},
+        }
+    } else {
         return Ok(VersionEnd::Campaign(ended));
-    }
-    if !is_newer {
-        process.run_to_end().await?;
     }
     if run.stop.is_cancelled() {
         return Ok(VersionEnd::Campaign(RunOutcome::Stopped));
