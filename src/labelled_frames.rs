@@ -43,7 +43,6 @@ pub fn command_error(error: UpfitError) -> CommandError {
     if error.is_wrong_input() { CommandError::input(error) } else { CommandError::failed(error) }
 }
 
-/// The labelled structures of all files.
 /// Refuses files whose formats have no labels. The name shows the format, with or without the extension of a compression.
 pub fn check_formats<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<(), CommandError> {
     for path in paths {
@@ -63,7 +62,7 @@ pub fn check_formats<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<()
 /// Labelled structures, and the files that they come from.
 pub type ReadFrames = (Vec<LabelledFrame>, Vec<DataFile>);
 
-/// The labelled structures of all files; `None` if it was asked to stop.
+/// The labelled structures of all files; `None` if it was asked to stop. Warns of stresses that are left out.
 ///
 /// # Errors
 /// A structure that cannot be read; labels that [`LabelledFrame::new`] refuses.
@@ -72,6 +71,24 @@ pub fn read_frames(
     validation: bool,
     stop: &CancellationToken,
 ) -> Result<Option<ReadFrames>, CommandError> {
+    let Some((read, stresses_left_out)) = read_without_warning(files, validation, stop)? else {
+        return Ok(None);
+    };
+    if stresses_left_out > 0 {
+        log_and_warn(format_args!(
+            "the stresses of {} are left out: not periodic in all three directions",
+            count(stresses_left_out, "structure")
+        ));
+    }
+    Ok(Some(read))
+}
+
+/// The same, with the number of stresses that are left out instead of the warning.
+pub fn read_without_warning(
+    files: &StructureFiles,
+    validation: bool,
+    stop: &CancellationToken,
+) -> Result<Option<(ReadFrames, u64)>, CommandError> {
     let mut reader = files.reader(Arc::default());
     let (mut frames, mut counts) = (Vec::new(), vec![0; files.files.len()]);
     let mut stresses_left_out = 0_u64;
@@ -84,12 +101,6 @@ pub fn read_frames(
         stresses_left_out += u64::from(has_stress && labelled.stress.is_none());
         frames.push(labelled);
     }
-    if stresses_left_out > 0 {
-        log_and_warn(format_args!(
-            "the stresses of {} are left out: not periodic in all three directions",
-            count(stresses_left_out, "structure")
-        ));
-    }
     let file = |(file, structures): (&StructureFile, u64)| -> Result<DataFile, CommandError> {
         let hash = file_hash::hash(&file.path).map_err(|error| {
             CommandError::Input(format!("{}: cannot be read: {error}", file.path.display()))
@@ -98,7 +109,7 @@ pub fn read_frames(
         Ok(DataFile { file: name, hash, structures, weight: file.weight, validation })
     };
     let sources = files.files.iter().zip(counts).map(file).collect::<Result<_, _>>()?;
-    Ok(Some((frames, sources)))
+    Ok(Some(((frames, sources), stresses_left_out)))
 }
 
 /// The frame with its labels, and whether these have a stress.

@@ -42,13 +42,12 @@ macro_rules! example {
 
 /// The example campaign and its files, from `configs/`.
 const CAMPAIGN: &[u8] = include_bytes!("../../configs/aluminium.toml");
-const FILES: [(&str, &[u8]); 12] = [
+const FILES: [(&str, &[u8]); 11] = [
     example!("data/al_eam_1l/kokkos.npz"),
     example!("data/al_eam_1l/gmm_artifacts.npz"),
     example!("data/al_eam_1l/seed_frames.extxyz"),
     example!("data/aluminium_seeds.extxyz"),
     example!("data/Al_mm.eam.fs"),
-    example!("data/al_eam_1l/replay.extxyz"),
     example!("data/aluminium_tests/cold.extxyz"),
     example!("data/aluminium_tests/hot.extxyz"),
     example!("data/aluminium_tests/liquid.extxyz"),

@@ -29,12 +29,11 @@ use crate::structure_files::StructureReadingArgs;
 /// greedy: the structure with the largest γ first; after each pick, a copy of the mixture learns it (additive update). Ends when no γ is
 /// above --min-gamma, or after N structures.
 ///
-/// fps (fps-extrap): farthest points over the atoms with γ within the window, of features that the mixture whitens; structures in the
-/// order in which their first atom is picked. Starts from what is picked already. fps-all: over all atoms, of plain features.
+/// fps (fps-extrap): picks the atom within the window that is farthest from those picked, in whitened features, and takes its
+/// structure. Starts from what earlier strategies picked. fps-all: over all atoms, in plain features.
 ///
-/// d-optimal: the structure whose atoms within the window add most to the information of a linear model of the features z: to
-/// log det Σ zzᵀ, summed over the elements. Starts from the training data, which weigh as much as one atom of each element, and from
-/// what is picked already.
+/// d-optimal: picks the structure whose atoms within the window raise log det Σ zzᵀ most, summed over the elements (z: features). Starts
+/// from the training data, which weigh as much as one atom of each element, and from what earlier strategies picked.
 ///
 /// random (random-all): uniformly at random. random-extrap: among structures with an atom within the window.
 ///
@@ -59,7 +58,7 @@ pub struct SelectArgs {
     /// features are used where the store has them
     #[arg(long, value_name = "DIR")]
     campaign: Vec<PathBuf>,
-    /// Of campaigns, only declined candidates
+    /// Take only declined candidates from campaigns
     #[arg(long, requires = "campaign")]
     declined: bool,
     /// Of campaigns, leave out candidates whose features are not stored or belong to another model or projection; otherwise the model is
@@ -83,7 +82,7 @@ pub struct SelectArgs {
     update_target: f64,
     /// Minimum number of atoms of each element in what is selected [default: D + 1, the feature dimension plus one; greedy alone: none]
     ///
-    /// Structures with many atoms of an element that has fewer take the place of the last ones that greedy has not picked.
+    /// If an element has fewer, structures with many of its atoms replace the last ones that other strategies than greedy picked.
     #[arg(long, value_name = "ATOMS")]
     min_per_element: Option<u64>,
     /// No minimum number of atoms of each element

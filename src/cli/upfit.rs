@@ -48,11 +48,11 @@ pub struct UpfitArgs {
     /// Passes over the training set
     #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
     epochs: u64,
-    /// Validate with the structures of this file, which is none of DATA, and train with all of DATA; may be repeated
+    /// Validate with the structures of this file, which must not be in DATA, and train with all of DATA; may be repeated
     #[arg(long, value_name = "FILE", conflicts_with = "validation_share")]
     validation: Vec<PathBuf>,
-    /// Share of the structures of DATA for validation, whole seed structures only and at least the smallest; 0: none, then the last
-    /// weights are written
+    /// Share of the structures of DATA for validation. Structures of one seed structure stay together, and at least the smallest such
+    /// group is held out. 0: no validation; the last weights are written
     #[arg(long, value_name = "X", default_value_t = 0.1, value_parser = share)]
     validation_share: f64,
     /// Weights of the loss. demo: energy 20, forces 5, stress 20; paper: 1, 5 and 0.1, after 5/12 of the epochs 25, 1 and 0.1

@@ -21,7 +21,7 @@ const SHOWN: usize = 20;
 /// Reports all errors with file, line and key (exit code 2). Valid but suspicious values are warnings on standard error and do
 /// not change the exit code. Grades every seed structure under the original mixture, measures a few steps on this host to
 /// estimate the time of walks, and shows the worst seed structures, each with the pair of elements that is closest to its
-/// limit. --csv has all seed structures with all their pairs (docs/seed-structures.md).
+/// minimum distance. --csv has all seed structures with all their pairs (docs/seed-structures.md).
 #[derive(Debug, clap::Args)]
 pub struct ValidateArgs {
     /// Configuration of a campaign (TOML)

@@ -137,8 +137,8 @@ pub struct NativeRefit {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("minimum" = 0, "exclusiveMaximum" = 1))]
     pub average: Option<f64>,
-    /// Share of the training structures for validation, whole seed structures only; from 0 up to, not including, 1. 0: none, then
-    /// the last weights are written.
+    /// Share of the training structures for validation; structures of one seed structure stay together. From 0 up to, not including,
+    /// 1. 0: no validation; the last weights are written.
     #[schemars(extend("minimum" = 0, "exclusiveMaximum" = 1))]
     pub validation_share: f64,
 }

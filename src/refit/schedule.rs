@@ -83,7 +83,7 @@ impl RefitSchedule {
         !self.is_converged() && !self.are_all_trained()
     }
 
-    /// Number of accepted structures at which biased walks make room for the next version. Those that made room for the last one
+    /// Number of accepted structures at which biased walks end for the next version. Those that ended for the last one
     /// stay ended.
     pub fn refit_at(&self, refit: &RefitSection) -> Option<u64> {
         if self.is_newest_without_walks() {

@@ -15,7 +15,7 @@ pub fn in_force(versions: &CampaignVersions, version: &VersionSummary) -> String
     let newer: Vec<_> = newer.map(|other| other.number.to_string()).collect();
     let newer = match newer.as_slice() {
         [] => String::new(),
-        numbers => format!("; not taken up yet: {}", numbers.join(", ")),
+        numbers => format!("; newer, no walk has used: {}", numbers.join(", ")),
     };
     let refused = versions.all.iter().filter(|other| !other.is_registered()).count();
     let refused = if refused == 0 { String::new() } else { format!("; {refused} refused") };

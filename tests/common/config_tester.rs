@@ -62,6 +62,13 @@ pub fn changed(from: &str, to: &str) -> String {
     text.replacen(from, to, 1)
 }
 
+/// This configuration without its section `[refit]`, which needs a mixture that can be updated.
+pub fn without_refit(text: &str) -> String {
+    let begin = text.find("\n[refit]").expect("the demo trains its potential");
+    let end = begin + text[begin..].find("\n[budget]").expect("the next section");
+    format!("{}{}", &text[..begin], &text[end..])
+}
+
 /// Number of the demo's line that contains this text.
 pub fn line(of: &str) -> usize {
     let text = demo("aluminium.toml");

@@ -60,7 +60,7 @@ struct BaselineSettingsArgs {
     /// D-optimality: maximum number of sweeps over the data
     #[arg(long, value_name = "N", default_value_t = BaselineSettings::default().max_sweeps)]
     max_sweeps: usize,
-    /// D-optimality: how far training atoms must reach in a direction for it to count, relative to the largest norm of features
+    /// D-optimality: leave out directions in which no training atom reaches this far, relative to the largest norm of features
     #[arg(long, value_name = "X", default_value_t = BaselineSettings::default().rank_tolerance)]
     rank_tolerance: f64,
     /// LLPR: η in λ = η tr G / D

@@ -62,7 +62,7 @@ pub struct CalmBuildArgs {
     /// Random seed
     #[arg(long, value_name = "N", default_value_t = 42)]
     rng_seed: u64,
-    /// Projected features of a model that has no projection yet; the norms of its basis are added to them [default: 128]
+    /// Projected features of a model that has no projection yet; the norms of the basis are further features [default: 128]
     #[arg(long, value_name = "D", value_parser = clap::value_parser!(u32).range(1..=65536))]
     projection_dimension: Option<u32>,
     /// Number of structures per shard. Each thread keeps one shard in memory
@@ -72,7 +72,7 @@ pub struct CalmBuildArgs {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
     /// Disk space beside the output for features, GB: passes 2 and 3 read there what pass 1 computed, and compute what does not fit.
-    /// Of a build in parts, for each process. 0: nothing is kept
+    /// With --part, the limit applies to each process. 0 keeps nothing
     #[arg(long, value_name = "GB", default_value_t = 4.0, value_parser = gigabytes)]
     max_feature_cache: f64,
     /// Discard the saved state and start from pass 1

@@ -23,8 +23,8 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 /// Draw a weighted sample of structures that stands for a data set of any size
 ///
 /// Draws whole structures at random, without replacement, so that the sample has about N atoms of each element, or all there are. An
-/// element draws at least N atoms, and fewer than N plus those of its largest structure. What one element draws serves the others, so
-/// frequent elements get more.
+/// element draws at least N atoms, and fewer than N plus those of its largest structure. A structure drawn for one
+/// element also counts for the others in it, so frequent elements get more.
 ///
 /// Writes each structure as it is, with its labels and with calmwalk_weight: the number of structures of the data that it stands for.
 /// `calm build` and `upfit` multiply it by --weight of the file. Weighted sums over the sample are those over the data, up to the

@@ -67,7 +67,7 @@ pub struct CalmScoreArgs {
     /// Also write the disagreement of the forces with those of this model; may be repeated
     #[arg(long, value_name = "MODEL.npz")]
     ensemble: Vec<PathBuf>,
-    /// Also write γ averaged over the neighbours with other weights than γ_nbr has, as gamma_nbr_uniform and so on; may be repeated.
+    /// Also write a neighbour average of γ with weights of your choice, as gamma_nbr_uniform and so on; may be repeated.
     /// cosine counts a neighbour by its distance, uniform counts each one fully; a radius in Å limits the neighbours within the
     /// model's cutoff, such as uniform:3.2
     #[arg(long, value_name = "WEIGHTS[:RADIUS]")]

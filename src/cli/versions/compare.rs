@@ -12,7 +12,7 @@ use crate::output::{print, print_json};
 /// Compare the errors of two versions
 ///
 /// Compares them on the data sets that both were judged by. If one is version 0 or the parent of the other, both were evaluated on
-/// the same structures. Otherwise a set that has grown meanwhile, as labels held out do, is not compared.
+/// the same structures. Otherwise, a set that has grown in between, such as the held-out labels, is left out.
 #[derive(Debug, clap::Args)]
 pub struct VersionsCompareArgs {
     /// Number of a version; 0 is that of the configuration
