@@ -11,7 +11,7 @@ use super::failure::RefitFailure;
 use super::settings::{RefitSettings, RefitterConfig};
 use super::training_set::{LabelFile, LabelFiles};
 use crate::exit_status::CommandError;
-use crate::labelled_frames::{command_error, read_frames};
+use crate::labelled_frames::{command_error, read_without_warning};
 use crate::process_config::HashedFile;
 use crate::structure_files::StructureReadingArgs;
 
@@ -101,8 +101,8 @@ impl DataSets {
         stop: &CancellationToken,
     ) -> Result<Option<Self>, RefitFailure> {
         let read = |paths: &[PathBuf]| -> Result<Vec<LabelledFrame>, CommandError> {
-            let found = read_frames(&StructureReadingArgs::default().files(paths)?, true, stop)?;
-            Ok(found.map(|(frames, _)| frames).unwrap_or_default())
+            let found = read_without_warning(&StructureReadingArgs::default().files(paths)?, true, stop)?;
+            Ok(found.map(|((frames, _), _)| frames).unwrap_or_default())
         };
         let mut sets = Vec::new();
         let mut add = |name: &str, kind, paths: &[PathBuf]| -> Result<(), RefitFailure> {
