@@ -1,7 +1,7 @@
 //! Force errors by grade, failures, and unlabelled structures.
 
 use analysis::ForceErrors;
-use monitor::label_statistics::{LARGE_FORCE_ERROR, LabelStatistics};
+use monitor::label_statistics::{ErrorsByGrade, LARGE_FORCE_ERROR, LabelStatistics};
 use store::{FailureCount, Unlabelled, ValueRange};
 
 use super::{PageTable, TableCell, count, percent, real, text};
@@ -32,22 +32,31 @@ pub fn correlations(statistics: &LabelStatistics) -> PageTable {
     {
         let (gamma, nbr) = (&grades.gamma, &grades.gamma_nbr);
         if gamma.atoms() > 0 {
-            table.rows.push(vec![
+            let mut row = vec![
                 text(name),
                 count(grades.structures),
                 count(gamma.atoms()),
                 real(gamma.mean(), 3),
                 percent(gamma.fraction_above(1.0)),
                 percent(nbr.fraction_above(1.0)),
-                real(gamma.spearman(), 3),
-                real(nbr.spearman(), 3),
-                real(gamma.roc_auc(), 3),
-                real(nbr.roc_auc(), 3),
-                count(gamma.sampled() as u64),
-            ]);
+            ];
+            row.extend(ranking(grades));
+            table.rows.push(row);
         }
     }
     table
+}
+
+/// How well γ and γ_nbr rank the errors: ρ of both, ROC-AUC of both, and the number of atoms they are from.
+pub fn ranking(grades: &ErrorsByGrade) -> [TableCell; 5] {
+    let (gamma, nbr) = (&grades.gamma, &grades.gamma_nbr);
+    [
+        real(gamma.spearman(), 3),
+        real(nbr.spearman(), 3),
+        real(gamma.roc_auc(), 3),
+        real(nbr.roc_auc(), 3),
+        count(gamma.sampled() as u64),
+    ]
 }
 
 /// The table of quantiles by one of the grades, as in the paper.

@@ -3,6 +3,7 @@
 use monitor::label_statistics::{LARGE_FORCE_ERROR, LabelStatistics};
 use monitor::versions::{CampaignVersions, VersionSetErrors};
 
+use super::labels::ranking;
 use super::{PageTable, count, percent, real, text};
 
 /// All versions and refused attempts. Without rows if the campaign has never trained one, as the next table.
@@ -94,19 +95,16 @@ pub fn grades(statistics: &LabelStatistics) -> PageTable {
     ];
     let mut table = PageTable::new("version-grades", &caption, &titles);
     for (version, grades) in &statistics.by_version {
-        let (gamma, nbr) = (&grades.gamma, &grades.gamma_nbr);
-        table.rows.push(vec![
+        let gamma = &grades.gamma;
+        let mut row = vec![
             text(version.to_string()),
             count(grades.structures),
             count(gamma.atoms()),
             real(gamma.mean(), 3),
             real(gamma.median(), 3),
-            real(gamma.spearman(), 3),
-            real(nbr.spearman(), 3),
-            real(gamma.roc_auc(), 3),
-            real(nbr.roc_auc(), 3),
-            count(gamma.sampled() as u64),
-        ]);
+        ];
+        row.extend(ranking(grades));
+        table.rows.push(row);
     }
     table
 }
