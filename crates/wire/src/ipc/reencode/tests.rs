@@ -8,9 +8,9 @@ use proptest::prelude::*;
 use super::*;
 use crate::control::ControlError;
 use crate::ids::{Origin, WalkId};
-use crate::messages::{Assignment, AssignmentReport, Outcome, WalkProgress};
+use crate::messages::{Assignment, AssignmentReport, Outcome, WalkEnd, WalkProgress};
 use crate::protocol::frame::FrameError;
-use crate::protocol::message::AnswerBody;
+use crate::protocol::message::{AnswerBody, SenderId};
 use any::{answer, assignment, given, offer, offered, report, request, sender};
 use common::candidate;
 
@@ -161,6 +161,16 @@ proptest! {
     }
 
     #[test]
+    fn excessive_lengths_of_assignments_are_rejected(mut assignment in assignment()) {
+        assignment.conditions.group = "a group".to_owned();
+        assignment.checkpoint = Some(b"checkpoint".to_vec());
+        let given = given(1, 1, &assignment);
+        prop_assert!(super::answer(&given).is_ok());
+        prop_assert!(is_refused_with_excessive_length(super::answer, &given, b"a group"));
+        prop_assert!(is_refused_with_excessive_length(super::answer, &given, b"checkpoint"));
+    }
+
+    #[test]
     fn invalid_assignments_are_rejected(assignment in assignment()) {
         let refused = |assignment: &Assignment| super::answer(&given(1, 1, assignment)).unwrap_err().to_string();
         let with = |seed_structure| Assignment { seed_structure, ..assignment.clone() };
@@ -210,22 +220,25 @@ fn errors_are_specific() {
     assert!(matches!(super::answer(&bytes[..7]), Err(RejectedMessage::Frame(FrameError::Short(7)))));
 }
 
-/// The length of a text or list is not trusted.
+/// Whether a message is rejected that states 2⁶³ bytes for this text or list, of fewer than 128 bytes.
+fn is_refused_with_excessive_length(read: Reader, message: &[u8], text: &[u8]) -> bool {
+    let content = content(message);
+    let at = content.windows(text.len()).position(|found| found == text).expect("the text");
+    let (before, length) = content[..at].split_at(at - 1);
+    assert_eq!(length, [u8::try_from(text.len()).expect("short")]);
+    let excessive = [&[0xff; 9][..], &[1]].concat();
+    let changed = encoded(&[before, &excessive, &content[at..]].concat());
+    matches!(read(&changed), Err(RejectedMessage::Control(ControlError::Content(_))))
+}
+
 #[test]
 fn excessive_lengths_are_rejected() {
-    let absurd = [&[0xff; 9][..], &[1]].concat();
-    let is_refused = |read: Reader, content: &[&[u8]]| {
-        matches!(read(&encoded(&content.concat())), Err(RejectedMessage::Control(ControlError::Content(_))))
-    };
-    // Session, walker, incarnation; offer 1 with a report: walk 0, assignment 0, ended, blew up, and a reason of 2⁶³
-    // bytes.
-    let envelope = [0, 0, 0, 0, 1, 1, 0, 0, 3, 4];
-    // No reason, no checkpoint, zero progress.
-    let rest = [&[0, 0][..], &[0, 0], &[0; 32], &[0, 0, 0]].concat();
-    assert!(super::request(&encoded(&[&envelope[..], &rest].concat())).is_ok());
-    assert!(is_refused(super::request, &[&envelope, &absurd, &rest[1..]]));
-    // Answer to offer 1: an assignment, mixture 0, campaign, walk 0, assignment 0, biased, random walk 0, and 2⁶³
-    // species.
-    let body = [&[1, 0, 0][..], &[0; 16], &[0; 4]].concat();
-    assert!(is_refused(super::answer, &[&body, &absurd, &[0; 100]]));
+    let sender = SenderId { session: 0, walker: 0, incarnation: 0 };
+    let outcome = Outcome::Ended(WalkEnd::Diverged { reason: "a reason".to_owned() });
+    let (checkpoint, progress) = (b"checkpoint".to_vec(), WalkProgress::default());
+    let report = AssignmentReport { walk: WalkId(0), assignment: 0, outcome, checkpoint, progress };
+    let offer = offered(sender, 1, Some(&report));
+    assert!(super::request(&offer).is_ok());
+    assert!(is_refused_with_excessive_length(super::request, &offer, b"a reason"));
+    assert!(is_refused_with_excessive_length(super::request, &offer, b"checkpoint"));
 }

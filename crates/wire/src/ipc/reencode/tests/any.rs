@@ -25,6 +25,7 @@ fn end() -> impl Strategy<Value = WalkEnd> {
     prop_oneof![
         Just(WalkEnd::Completed),
         Just(WalkEnd::QuotaReached),
+        Just(WalkEnd::Budget),
         Just(WalkEnd::Superseded),
         Just(WalkEnd::NothingNew),
         ".{0,40}".prop_map(|guard| WalkEnd::Trapped { guard }),
