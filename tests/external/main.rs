@@ -9,6 +9,7 @@ mod common;
 mod browser;
 mod dft;
 mod faults;
+mod gracemaker_refit;
 mod loaders;
 mod pictures;
 mod postgres_faults;

@@ -17,6 +17,12 @@ const WIDTH: usize = 31;
 /// Steps of a biased walk, as in the paper.
 const BIASED_STEPS: u64 = 15_000;
 
+/// What closes the loop, for users who have labelled structures that the potential knows.
+const REFIT: &str =
+    "# [refit]                       # train the potential from the labels, and go on with it (docs/refit.md)
+# replay = [\"train.extxyz\"]     # labelled structures that it knows: its training data, or a sample of them
+# after_structures = 50         # train when so many more structures are accepted";
+
 /// A section.
 pub struct WrittenSection {
     /// `[name]`
@@ -87,8 +93,12 @@ pub fn configuration(
         }
         false => {
             let shown = sections.iter().filter(|section| !section.keys.is_empty());
-            let body = shown.map(WrittenSection::text).collect::<Vec<_>>().join("\n\n");
-            (body, "All other keys have their defaults: docs/configuration.md, or `calmwalk init … --full`.")
+            let mut shown: Vec<_> = shown.map(WrittenSection::text).collect();
+            shown.push(REFIT.to_owned());
+            (
+                shown.join("\n\n"),
+                "All other keys have their defaults: docs/configuration.md, or `calmwalk init … --full`.",
+            )
         }
     };
     Ok(format!(
