@@ -1,4 +1,4 @@
-//! A campaign whose potential is trained by gracemaker, by the script of `configs/refit`, for two rounds. Needs a Python with
+//! A campaign whose potential is trained by gracemaker, by `configs/gracemaker.sh`, for two rounds. Needs a Python with
 //! tensorpotential, named by `CALMWALK_GRACEMAKER_PYTHON` (`.ci/loaders` makes one), and the checkpoint of the model in
 //! `CALMWALK_PEER_DATA`.
 //!
@@ -42,7 +42,7 @@ fn gracemaker_trains_two_versions() {
     file_checkpoint(here);
     let frames = read_extxyz(&config("data/al_eam_1l/seed_frames.extxyz")).unwrap();
     write_frames(&here.join("replay.extxyz"), &frames[..REPLAY]);
-    let script = config("refit/gracemaker.sh");
+    let script = config("gracemaker.sh");
     let refit = format!(
         "[refit]\nreplay = [\"replay.extxyz\"]\nmax_versions = 2\nheld_out = 0.0\nmethod = {{ command = {{ program = [\"{}\"] }} }}\n",
         script.display()
