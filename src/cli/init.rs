@@ -1,10 +1,13 @@
 //! `calmwalk init`
 
+mod create;
+mod label_kind;
 mod label_section;
 mod own_campaign;
 mod questions;
 mod suggestion;
 mod text;
+mod written_section;
 
 use std::fs::{self, File};
 use std::io::Write;
@@ -66,7 +69,7 @@ const SCHEMA_LINE: &str = "#:schema ./campaign.schema.json\n\n";
 impl InitArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         if self.own.is_given() {
-            return own_campaign::create(&self.directory, self.own);
+            return create::create(&self.directory, self.own);
         }
         let config = self.directory.join(CONFIG);
         let written = [SCHEMA_LINE.as_bytes(), CAMPAIGN].concat();

@@ -2,9 +2,9 @@
 
 use potentials::grace::{GradientWorker, Threads, TrainableGrace, WeightSums};
 
-use crate::data::FrameFault;
 use crate::differences::FrameDifferences;
 use crate::error::UpfitError;
+use crate::frame_fault::FrameFault;
 use crate::loss::{BatchCounts, LossWeights, loss_gradient};
 use crate::prepared::PreparedFrame;
 

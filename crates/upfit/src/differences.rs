@@ -4,11 +4,8 @@ use atoms::Evaluation;
 use serde::{Deserialize, Serialize};
 
 use crate::data::LabelledFrame;
-use crate::loss::{LossWeights, huber};
+use crate::loss::{LossWeights, STRESS_COMPONENTS, huber};
 use crate::progress::SetErrors;
-
-/// The six components of a symmetric matrix.
-pub const STRESS_COMPONENTS: [(usize, usize); 6] = [(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)];
 
 /// Sums over differences of one quantity.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use crate::data::FrameFault;
 use crate::energy_zero::EnergyZeroFault;
+use crate::frame_fault::FrameFault;
 
 /// Why a training cannot begin or go on.
 #[derive(Debug, thiserror::Error)]

@@ -7,13 +7,15 @@ use analysis::LabelledEnergy;
 use atoms::{Evaluation, Potential, composition};
 use potentials::grace::{Grace, GraceModel, Threads};
 
-use crate::data::{FrameFault, LabelledFrame};
+use crate::data::LabelledFrame;
 use crate::differences::FrameDifferences;
 use crate::energy_zero::EnergyZero;
 use crate::error::UpfitError;
+use crate::frame_fault::FrameFault;
 use crate::loss::LossSettings;
 use crate::prepared::{NEIGHBOUR_BYTES, PreparedFrame, prepare};
 use crate::progress::SetErrors;
+use crate::stop_request::StopRequest;
 
 /// What the model says of one frame.
 #[derive(Clone, Copy, Debug)]
@@ -23,9 +25,6 @@ pub struct EvaluatedFrame {
     /// Its differences from the labels.
     pub differences: FrameDifferences,
 }
-
-/// Asks whether to stop; once it says so, it goes on to say so.
-pub type StopRequest<'a> = &'a (dyn Fn() -> bool + Sync);
 
 /// Evaluates all frames, with the δ of the loss. The result does not depend on the number of threads. Returns `None` if `stop` asked
 /// for it before the last frame.

@@ -5,7 +5,9 @@ use atoms::{Evaluation, Vec3};
 use potentials::grace::LossGradient;
 
 use crate::data::LabelledFrame;
-use crate::differences::STRESS_COMPONENTS;
+
+/// The six components of a symmetric matrix.
+pub const STRESS_COMPONENTS: [(usize, usize); 6] = [(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)];
 
 /// δ of the demonstration and the paper's programs, in the unit of each quantity (eV, eV/Å, eV/Å³).
 const DELTA: f64 = 0.01;

@@ -5,9 +5,10 @@ use std::borrow::Cow;
 use atoms::NeighbourList;
 use potentials::grace::GraceModel;
 
-use crate::data::{FrameFault, LabelledFrame};
+use crate::data::LabelledFrame;
 use crate::error::UpfitError;
-use crate::evaluation::StopRequest;
+use crate::frame_fault::FrameFault;
+use crate::stop_request::StopRequest;
 
 /// Memory for neighbour lists that are built once, bytes. The others are built at each use.
 pub const NEIGHBOUR_BYTES: usize = 4 << 30;

@@ -15,13 +15,14 @@ use crate::batch_gradient::BatchSums;
 use crate::checkpoint::{CheckpointFile, TrainingState};
 use crate::data::TrainingData;
 use crate::error::UpfitError;
-use crate::evaluation::{EvaluatedFrame, StopRequest, evaluate};
+use crate::evaluation::{EvaluatedFrame, evaluate};
 use crate::frozen::frozen_weights;
 use crate::identity::identity;
 use crate::loss::LossWeights;
 use crate::prepared::{NEIGHBOUR_BYTES, PreparedFrame, prepare};
 use crate::progress::{TrainingEvent, UpdateProgress};
 use crate::settings::UpfitSettings;
+use crate::stop_request::StopRequest;
 
 /// Trains the weights of a model. Continues from the checkpoint if there is one; the result has the same bits.
 ///

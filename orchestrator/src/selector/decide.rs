@@ -26,8 +26,6 @@ const CONTROL_PRIORITY: i32 = 0;
 pub(super) const LEFT_OUT: &str = "left_out";
 /// Kind of the decision that makes updates additive.
 pub(super) const FORGETTING: &str = "forgetting";
-/// Kind of the decision that takes up a version of the potential, and the value with its number.
-pub const VERSION: &str = "version";
 
 impl DecisionState {
     /// Decides on the reports of a round, in order. `assigned` contains the walks that walkers work on.

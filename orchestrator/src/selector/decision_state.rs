@@ -11,7 +11,6 @@ use store::records::{Commit, ComponentRecord, Decision, STALENESS, WalkRecord};
 use wire::{ContentHash, WalkId};
 
 use super::backlog::Backlog;
-use super::decide::VERSION;
 use super::error::SelectorError;
 use super::forgetting::Forgetting;
 use super::regrade::Regrader;
@@ -24,6 +23,8 @@ use crate::grader::Grader;
 
 /// Name of the value that tells that updates have become additive.
 pub const ADDITIVE: &str = "additive_updates";
+/// Kind of the decision that takes up a version of the potential, and the value with its number.
+pub const VERSION: &str = "version";
 
 /// Name of the value with the steps that biased walks made since the last accepted structure.
 const STEPS_WITHOUT_STRUCTURE: &str = "steps_without_structure";

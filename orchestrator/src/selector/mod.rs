@@ -36,8 +36,9 @@ use wire::{CampaignId, WalkId};
 
 use crate::grader::Grader;
 use backlog::Backlog;
-pub use decide::{VERSION, update_settings_in_force};
+pub use decide::update_settings_in_force;
 use decision_state::DecisionState;
+pub use decision_state::VERSION;
 pub use error::SelectorError;
 pub use mixture_history::{AcceptedAtoms, MixtureHistory};
 pub use regrade::{RegradedCandidate, RegradedReport, Regrader};

@@ -8,8 +8,7 @@ use wire::messages::WalkEnd;
 use wire::{WalkConditions, WalkId};
 
 use super::SeedStructurePlan;
-use super::decide::VERSION;
-use super::decision_state::{ADDITIVE, DecisionState};
+use super::decision_state::{ADDITIVE, DecisionState, VERSION};
 use super::rules::{CONFIGURATION, RULES};
 use super::walk::Walk;
 

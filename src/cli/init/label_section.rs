@@ -4,15 +4,15 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use atoms::Species;
-use clap::ValueEnum;
 use dft::abinit::AbinitSettings;
 use dft::ase::AseSettings;
 use dft::cp2k::Cp2kSettings;
 use dft::gpaw::GpawSettings;
 use dft::vasp::VaspSettings;
 
-use super::own_campaign::{OwnCampaign, path_value, quoted};
-use super::text::{WrittenKey, WrittenSection, list};
+use super::label_kind::InitLabelKind;
+use super::own_campaign::OwnCampaign;
+use super::written_section::{WrittenKey, WrittenSection, list, path_value, quoted};
 use crate::config::FILL_IN;
 use crate::exit_status::CommandError;
 
@@ -21,58 +21,6 @@ const POTENTIALS: [(&str, &str); 4] =
     [(".npz", "grace"), (".eam.alloy", "eam_alloy"), (".eam.fs", "eam_fs"), (".sw", "stillinger_weber")];
 
 const AS_TRAINED: &str = "as for the data that the model was trained on";
-
-/// What makes labels.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum InitLabelKind {
-    /// ABINIT
-    Abinit,
-    /// Any ASE calculator
-    Ase,
-    /// A program of your own
-    Command,
-    /// CP2K
-    Cp2k,
-    /// GPAW
-    Gpaw,
-    /// A potential that calmwalk evaluates, such as another GRACE model
-    Potential,
-    /// VASP
-    Vasp,
-}
-
-impl InitLabelKind {
-    /// All names, for questions.
-    pub fn names() -> String {
-        let names = Self::value_variants().iter().map(|kind| kind.name());
-        names.collect::<Vec<_>>().join(", ")
-    }
-
-    fn name(self) -> &'static str {
-        match self {
-            Self::Abinit => "abinit",
-            Self::Ase => "ase",
-            Self::Command => "command",
-            Self::Cp2k => "cp2k",
-            Self::Gpaw => "gpaw",
-            Self::Potential => "potential",
-            Self::Vasp => "vasp",
-        }
-    }
-
-    /// What the labels come from.
-    pub fn source(self) -> &'static str {
-        match self {
-            Self::Abinit => "directory of pseudopotentials, such as Si.psp8",
-            Self::Ase => "Python file that defines calculator()",
-            Self::Command => "script that reads structure.extxyz and writes label.extxyz",
-            Self::Cp2k => "directory with BASIS_MOLOPT and GTH_POTENTIALS",
-            Self::Gpaw => "directory of PAW setups",
-            Self::Potential => "file of a potential (.npz, .eam.alloy, .eam.fs, .sw)",
-            Self::Vasp => "directory of POTCAR files, such as Al_pv/POTCAR",
-        }
-    }
-}
 
 /// The section for the labels of a campaign from seed structures of these elements.
 ///
@@ -214,15 +162,5 @@ mod tests {
         }
         let error = method("model.pt").unwrap_err().to_string();
         assert!(error.contains("model.pt") && error.contains(".eam.alloy"), "{error}");
-    }
-
-    #[test]
-    fn every_kind_has_the_name_of_its_method() {
-        for kind in InitLabelKind::value_variants() {
-            let possible = kind.to_possible_value().unwrap();
-            assert_eq!(possible.get_name(), kind.name());
-            let is_method = dft::DftSettings::NAMES.contains(&kind.name());
-            assert!(is_method || *kind == InitLabelKind::Potential, "{kind:?}");
-        }
     }
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::ValueEnum;
 
-use super::label_section::InitLabelKind;
+use super::label_kind::InitLabelKind;
 use super::own_campaign::{OwnCampaign, OwnCampaignArgs, check_readable};
 use crate::exit_status::CommandError;
 

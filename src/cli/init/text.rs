@@ -1,18 +1,15 @@
-//! The text of a configuration: its sections, each key with its comment.
+//! The text of a configuration of one's own.
 
 use std::path::Path;
 
 use potentials::{RadiiWindows, ZblWindow, ZblWindows};
 
 use super::label_section::label_section;
-use super::own_campaign::{OwnCampaign, path_value};
+use super::own_campaign::OwnCampaign;
 use super::suggestion::{MIN_ATOMS, MIN_HEIGHT, SuggestedSettings};
+use super::written_section::{WrittenKey, WrittenSection, list, path_value};
 use super::{CAMPAIGN, SCHEMA_LINE};
-use crate::config::usual_range;
 use crate::exit_status::CommandError;
-
-/// Columns of a key and its value, before the comment.
-const WIDTH: usize = 31;
 
 /// Steps of a biased walk, as in the paper.
 const BIASED_STEPS: u64 = 15_000;
@@ -22,54 +19,6 @@ const REFIT: &str =
     "# [refit]                       # train the potential from the labels, and go on with it (docs/refit.md)
 # replay = [\"train.extxyz\"]     # labelled structures that it knows: its training data, or a sample of them
 # after_structures = 50         # train when so many more structures are accepted";
-
-/// A section.
-pub struct WrittenSection {
-    /// `[name]`
-    header: String,
-    keys: Vec<WrittenKey>,
-}
-
-/// A key with its value and what it means.
-pub struct WrittenKey {
-    name: &'static str,
-    value: String,
-    comment: String,
-}
-
-impl WrittenSection {
-    /// A section with this header.
-    pub fn new(header: impl Into<String>, keys: Vec<WrittenKey>) -> Self {
-        Self { header: header.into(), keys }
-    }
-
-    fn text(&self) -> String {
-        let lines: Vec<_> = self.keys.iter().map(WrittenKey::line).collect();
-        format!("{}\n{}", self.header, lines.join("\n"))
-    }
-}
-
-impl WrittenKey {
-    /// A key, its value in TOML, and its comment.
-    pub fn new(name: &'static str, value: impl Into<String>, comment: impl Into<String>) -> Self {
-        Self { name, value: value.into(), comment: comment.into() }
-    }
-
-    /// A comment that ends with the usual range of a dotted key, if there is one.
-    pub fn with_range(comment: &str, key: &str) -> String {
-        usual_range(key).map_or(comment.to_owned(), |range| format!("{comment} (usual: {range})"))
-    }
-
-    fn line(&self) -> String {
-        let setting = format!("{} = {}", self.name, self.value);
-        format!("{setting:<WIDTH$}   # {}", self.comment)
-    }
-}
-
-/// A list of values in TOML.
-pub fn list(values: impl IntoIterator<Item = String>) -> String {
-    format!("[{}]", values.into_iter().collect::<Vec<_>>().join(", "))
-}
 
 /// The text of the configuration in `directory`.
 ///

@@ -56,8 +56,12 @@ pub fn fine_tune(
     mut show: impl FnMut(&TrainingEvent<'_>),
 ) -> Result<Option<FineTuned>, CommandError> {
     let settings = &request.settings;
-    check_formats(request.data.paths().chain(request.validation.iter().flat_map(StructureFiles::paths)))?;
-    check_paths(request)?;
+    let data = request.data.paths().map(|path| (path, "a file of training data"));
+    let validation = request.validation.iter().flat_map(StructureFiles::paths);
+    let structures: Vec<_> = data.chain(validation.map(|path| (path, "a file of validation data"))).collect();
+    check_formats(structures.iter().map(|(path, _)| *path))?;
+    let outputs = [&request.output, &request.checkpoint].into_iter().chain(&request.figure);
+    check_paths(&request.model, &structures, &outputs.map(PathBuf::as_path).collect::<Vec<_>>())?;
     let model = TrainableGrace::load(&request.model).map_err(CommandError::input)?;
     let Some((data, files)) = read_data(request, stop)? else { return Ok(None) };
     let name = request.model.display().to_string();

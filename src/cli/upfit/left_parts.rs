@@ -3,20 +3,18 @@
 use std::fs;
 use std::path::Path;
 
-use super::paths::resolved;
 use crate::atomic_file::cannot_write;
 use crate::cli::CommandError;
 
 /// Number of random characters in the name of a temporary file, as `tempfile` makes it.
 const RANDOM: usize = 6;
 
-/// Removes the temporary files `.NAME.RANDOM.part` beside the file NAME, which a killed process has left. A directory that cannot
-/// be read has none.
+/// Removes the temporary files `.NAME.RANDOM.part` beside the file NAME, which a killed process has left; `target` is its path without
+/// symbolic links. A directory that cannot be read has none.
 ///
 /// # Errors
 /// A file that cannot be removed.
 pub fn remove_left_parts(target: &Path) -> Result<(), CommandError> {
-    let target = resolved(target);
     let (Some(directory), Some(name)) = (target.parent(), target.file_name()) else { return Ok(()) };
     let name = name.to_string_lossy();
     for entry in fs::read_dir(directory).into_iter().flatten().flatten() {

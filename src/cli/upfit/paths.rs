@@ -3,24 +3,22 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use super::fine_tuning::FineTuning;
 use super::left_parts::remove_left_parts;
 use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::CommandError;
 
 /// Checks that no file of structures is given twice, and that outputs can be written, and replace neither an input nor each
-/// other. Two names of one file are recognised. Removes what a killed process left beside the outputs.
-pub fn check_paths(request: &FineTuning) -> Result<(), CommandError> {
-    let FineTuning { model, data, validation, output, checkpoint, figure, .. } = request;
-    let data = data.paths().map(|path| (path, "a file of training data"));
-    let validation = validation.iter().flat_map(|files| files.paths());
-    let validation = validation.map(|path| (path, "a file of validation data"));
-    let structures: Vec<_> = data.chain(validation).collect();
-    refuse_the_same(&structures)?;
-    let outputs = [Some(output), Some(checkpoint), figure.as_ref()];
+/// other. Two names of one file are recognised. Removes what a killed process left beside the outputs. Each file of structures
+/// comes with a description.
+pub fn check_paths(
+    model: &Path,
+    structures: &[(&Path, &str)],
+    outputs: &[&Path],
+) -> Result<(), CommandError> {
+    refuse_the_same(structures)?;
     let mut known = BTreeMap::new();
-    for output in outputs.into_iter().flatten() {
-        refuse_to_replace(output, std::iter::once((model.as_path(), "the model")))?;
+    for output in outputs {
+        refuse_to_replace(output, std::iter::once((model, "the model")))?;
         refuse_to_replace(output, structures.iter().copied())?;
         if let Some(other) = known.insert(resolved(output), output) {
             let (output, other) = (output.display(), other.display());
@@ -28,7 +26,7 @@ pub fn check_paths(request: &FineTuning) -> Result<(), CommandError> {
                 "{output} and {other}: one file is named for two outputs"
             )));
         }
-        remove_left_parts(output)?;
+        remove_left_parts(&resolved(output))?;
         AtomicFile::create(output).map(drop)?;
     }
     Ok(())

@@ -6,12 +6,12 @@ use atoms::composition;
 use super::Trainer;
 use crate::adam::AdamState;
 use crate::checkpoint::{BestWeights, TrainingState};
-use crate::data::{FrameFault, MAX_ENERGY_DIFFERENCE};
 use crate::differences::FrameDifferences;
 use crate::energy_deviations::EnergyDeviations;
 use crate::energy_zero::EnergyZero;
 use crate::error::UpfitError;
 use crate::evaluation::{EvaluatedFrame, first_not_finite, sum};
+use crate::frame_fault::{FrameFault, MAX_ENERGY_DIFFERENCE};
 use crate::prepared::PreparedFrame;
 use crate::progress::ErrorsBySet;
 
