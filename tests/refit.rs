@@ -243,6 +243,14 @@ fn what_a_program_leaves_is_judged() {
     assert!(reason.contains("left no model.npz"), "{reason}");
     let reason = refused(here, &by("echo text > model.npz"));
     assert!(reason.contains("the new model cannot be read"), "{reason}");
+    // Paths that are relative to the directory of the run, which is not that of the program.
+    let find = "for file in \"$CALMWALK_TRAIN\" \"$CALMWALK_HELD_OUT\" \"$CALMWALK_REPLAY\" \"$CALMWALK_PARENT_MODEL\"; do
+        test -f \"$file\" || exit 4; done; test -d \"$CALMWALK_REFIT_DIRECTORY\" && exit 7";
+    let mut relative = by(find);
+    relative["directory"] = json!("campaign");
+    relative["settings"]["replay"][0]["path"] = json!("replay.extxyz");
+    let reason = refused(here, &relative);
+    assert!(reason.contains("exit status: 7"), "{reason}");
     let absent = json!({ "command": { "program": ["./no-such-program"] } });
     let reason = refused(here, &settings(here, "campaign", absent));
     assert!(reason.contains("./no-such-program: cannot be started"), "{reason}");

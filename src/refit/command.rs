@@ -1,5 +1,6 @@
 //! Training by a program of the user.
 
+use std::ffi::OsStr;
 use std::fs::{self, File};
 use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::os::unix::ffi::{OsStrExt, OsStringExt};
@@ -96,7 +97,11 @@ fn prepare(
         _ => {}
     }
     let output = File::create(log).map_err(|error| cannot_write(log, error))?;
-    let replay: Vec<_> = config.settings.replay.iter().map(|file| file.path.as_os_str()).collect();
+    // The program has another working directory than this process.
+    let absolute = |path: &Path| std::path::absolute(path).map_err(CommandError::failed);
+    let replay = config.settings.replay.iter().map(|file| Ok(absolute(&file.path)?.into_os_string()));
+    let replay = replay.collect::<Result<Vec<_>, CommandError>>()?.join(OsStr::new(":"));
+    let held_out = held_out.map_or(Ok(PathBuf::new()), absolute)?;
     let mut process = Command::new(command.program.first().map_or("", String::as_str));
     process
         .args(command.program.iter().skip(1))
@@ -104,12 +109,12 @@ fn prepare(
         .stdin(Stdio::null())
         .stdout(output.try_clone().map_err(CommandError::failed)?)
         .stderr(output)
-        .env("CALMWALK_REFIT_DIRECTORY", directory)
-        .env("CALMWALK_PARENT_MODEL", &config.begin().path)
-        .env("CALMWALK_PARENT_MIXTURE", &config.parent_mixture.path)
-        .env("CALMWALK_TRAIN", train)
-        .env("CALMWALK_HELD_OUT", held_out.unwrap_or(Path::new("")))
-        .env("CALMWALK_REPLAY", replay.join(std::ffi::OsStr::new(":")))
+        .env("CALMWALK_REFIT_DIRECTORY", absolute(directory)?)
+        .env("CALMWALK_PARENT_MODEL", absolute(&config.begin().path)?)
+        .env("CALMWALK_PARENT_MIXTURE", absolute(&config.parent_mixture.path)?)
+        .env("CALMWALK_TRAIN", absolute(train)?)
+        .env("CALMWALK_HELD_OUT", held_out)
+        .env("CALMWALK_REPLAY", replay)
         .env("CALMWALK_RNG_SEED", config.rng_seed.to_string())
         .process_group(0)
         .kill_on_drop(true);

@@ -56,7 +56,7 @@ fn gracemaker_trains_two_versions() {
     run.env("PATH", path).env("LINEAGE", here.join("lineage")).env("EPOCHS", "2").env("BATCH_SIZE", "4");
     let run = run.output().unwrap();
     assert!(run.status.success(), "{}", stderr(&run));
-    let versions = on_store(here.join("campaign"), async |store| store.versions().await.unwrap());
+    let versions = on_store(here.join("campaign").into(), async |store| store.versions().await.unwrap());
     assert_eq!(versions.len(), 2);
     assert!(versions.iter().all(|version| version.state == VersionState::Registered), "{versions:?}");
     // Each was trained from the checkpoint of the one before.
