@@ -145,7 +145,9 @@ impl Case {
             (outcome.alpha, maximum(&outcome.gamma_after))
         };
         let mut mixture = self.consistent.clone();
-        before.iter().for_each(|&structure| drop(learn(&mut mixture, structure)));
+        for &structure in before {
+            learn(&mut mixture, structure);
+        }
         let mut left: Vec<usize> = (0..STRUCTURES).filter(|s| !before.contains(s)).collect();
         let mut picks = Vec::new();
         loop {
