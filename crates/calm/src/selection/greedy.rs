@@ -3,14 +3,10 @@
 use super::SelectionError;
 use super::lazy_heap::{Bound, LazyHeap};
 use super::learned_mixture::{Learned, LearnedMixture};
-use super::pool::{Pool, PoolAtom};
+use super::pool::Pool;
 use crate::mixture::Mixture;
 use crate::rules::Positive;
 
-/// Atoms that are graded at first after a pick; then twice as many each time, up to a limit. Most atoms that are graded a little too
-/// early have the largest bounds after the next pick.
-const FIRST_BATCH: usize = 32;
-const LARGEST_BATCH: usize = 4096;
 /// Atoms whose features are in the cache together.
 const GRADED_TOGETHER: usize = 64;
 
@@ -22,9 +18,10 @@ const NOT_GRADED: usize = usize::MAX;
 /// below the target, if need be with an inflation.
 ///
 /// Centroids, thresholds and the assignment of atoms do not change. C + αC_b ≥ C in the Loewner order (C_b is positive
-/// semidefinite), as is an inflation, so (C′ + εI)⁻¹ ≤ (C + εI)⁻¹ and no γ rises. The γ of an atom from before an update is
-/// therefore an upper bound, and only atoms whose bound is the largest are graded again: the picks are those of a complete grading
-/// after each pick.
+/// semidefinite), as is an inflation, so (C′ + εI)⁻¹ ≤ (C + εI)⁻¹ and no γ rises. The largest γ of a structure from before an update
+/// is therefore an upper bound, and only structures whose bound is the largest are graded again: the picks are those of a complete
+/// grading after each pick. All atoms of a structure are graded at once, because their features are side by side in memory; those that
+/// are not above the lower limit of the window never are again.
 ///
 /// The inverses of the copy follow from its covariances. Those of the given mixture may come from an artifact in single precision, so
 /// the first bounds are its γ with a factor that covers the difference.
@@ -32,9 +29,13 @@ const NOT_GRADED: usize = usize::MAX;
 pub struct Greedy<'a> {
     pool: &'a Pool,
     mixture: LearnedMixture,
-    /// Of the γ of atoms. Their version is the number of updates of the component.
+    /// Of the largest γ of structures. Their version is the number of updates of the component of that atom.
     bounds: LazyHeap,
+    /// The atom with the largest γ when a structure was graded, `[structures]`.
+    largest: Vec<usize>,
     taken: Vec<bool>,
+    /// Atoms that are no longer above the lower limit of the window, `[atoms]`.
+    covered: Vec<bool>,
 }
 
 /// A structure that was picked.
@@ -67,12 +68,18 @@ impl<'a> Greedy<'a> {
             pool,
             mixture: LearnedMixture::new(mixture, pool, target.into())?,
             bounds: LazyHeap::default(),
+            largest: vec![0; pool.len()],
             taken: vec![false; pool.len()],
+            covered: vec![false; pool.atoms().len()],
         };
         for structure in picked {
             greedy.learn(structure)?;
         }
-        greedy.bounds = LazyHeap::new(greedy.first_bounds());
+        for structure in 0..pool.len() {
+            if !greedy.taken[structure] {
+                greedy.add(structure);
+            }
+        }
         Ok(greedy)
     }
 
@@ -81,8 +88,7 @@ impl<'a> Greedy<'a> {
     /// # Errors
     /// Those of [`Self::new`].
     pub fn pick(&mut self) -> Result<Option<GreedyPick>, SelectionError> {
-        let Some(Bound { value: gamma, index: atom, .. }) = self.largest()? else { return Ok(None) };
-        let structure = self.pool.atoms()[atom].structure as usize;
+        let Some(Bound { value: gamma, index: structure, .. }) = self.largest()? else { return Ok(None) };
         let Learned { alpha, gamma_max } = self.learn(structure)?;
         Ok(Some(GreedyPick { structure, gamma_max: gamma, gamma_after: gamma_max, alpha }))
     }
@@ -96,49 +102,58 @@ impl<'a> Greedy<'a> {
         Ok(self.largest()?.map(|bound| bound.value))
     }
 
-    /// Bounds of the atoms within the window in structures that were not picked.
-    fn first_bounds(&self) -> Vec<Bound> {
-        let atoms =
-            self.pool.atoms().iter().enumerate().filter(|(_, atom)| {
-                self.pool.window().has(atom.gamma) && !self.taken[atom.structure as usize]
-            });
-        let bound = |(index, atom): (usize, &PoolAtom)| {
-            let factor = self.mixture.component(self.mixture.place(atom)).bound_factor;
-            Bound { value: factor * atom.gamma, preference: 0.0, index, version: NOT_GRADED }
-        };
-        atoms.map(bound).collect()
+    /// Puts a structure with its first bound into the queue, if it has an atom within the window.
+    fn add(&mut self, structure: usize) {
+        let bounds = self.pool.window_atoms_of(structure).map(|atom| {
+            let atom = &self.pool.atoms()[atom];
+            self.mixture.component(self.mixture.place(atom)).bound_factor * atom.gamma
+        });
+        if let Some(value) = bounds.reduce(f64::max) {
+            self.bounds.push(Bound { value, preference: 0.0, index: structure, version: NOT_GRADED });
+        }
     }
 
-    /// The atom with the largest γ, which stays in the queue.
+    /// The structure with the largest γ, which stays in the queue.
     fn largest(&mut self) -> Result<Option<Bound>, SelectionError> {
-        let mut batch = FIRST_BATCH;
+        // Small structures several at a time.
+        let structures = GRADED_TOGETHER * self.pool.len() / self.pool.atoms().len().max(1);
         loop {
-            let outdated = self.bounds.take_outdated(batch, |atom| {
-                let atom = &self.pool.atoms()[atom];
-                let place = self.mixture.place(atom);
-                (!self.taken[atom.structure as usize]).then(|| self.mixture.component(place).updates)
+            let outdated = self.bounds.take_outdated(structures.max(1), |structure| {
+                let place = self.mixture.place(&self.pool.atoms()[self.largest[structure]]);
+                (!self.taken[structure]).then(|| self.mixture.component(place).updates)
             });
             if outdated.is_empty() {
                 return Ok(self.bounds.largest());
             }
-            self.grade(outdated)?;
-            batch = LARGEST_BATCH.min(2 * batch);
+            self.grade(&outdated)?;
         }
     }
 
-    /// Grades atoms and puts those above the lower limit into the queue. The others never rise above it again.
-    fn grade(&mut self, mut atoms: Vec<usize>) -> Result<(), SelectionError> {
-        let (pool, mixture, bounds) = (self.pool, &self.mixture, &mut self.bounds);
+    /// Grades structures and puts those with an atom above the lower limit of the window into the queue.
+    fn grade(&mut self, structures: &[usize]) -> Result<(), SelectionError> {
+        let (pool, mixture) = (self.pool, &self.mixture);
         let place = |atom: usize| mixture.place(&pool.atoms()[atom]);
+        let atoms = structures.iter().flat_map(|structure| pool.window_atoms_of(*structure));
+        let mut atoms: Vec<usize> = atoms.filter(|atom| !self.covered[*atom]).collect();
         atoms.sort_unstable_by_key(|&atom| (place(atom), atom));
+        let mut above = Vec::new();
         let groups = atoms.chunk_by(|&a, &b| place(a) == place(b));
         for atoms in groups.flat_map(|group| group.chunks(GRADED_TOGETHER)) {
-            let component = mixture.component(place(atoms[0]));
-            for (value, &index) in component.gamma(pool, atoms)?.into_iter().zip(atoms) {
-                if value > pool.window().above {
-                    bounds.push(Bound { value, preference: 0.0, index, version: component.updates });
+            let gamma = mixture.component(place(atoms[0])).gamma(pool, atoms)?;
+            for (&atom, gamma) in atoms.iter().zip(gamma) {
+                self.covered[atom] = gamma <= pool.window().above;
+                if !self.covered[atom] {
+                    above.push((pool.atoms()[atom].structure, gamma, atom));
                 }
             }
+        }
+        above.sort_unstable_by(|a, b| a.0.cmp(&b.0).then_with(|| b.1.total_cmp(&a.1)));
+        // The first of each structure is the largest.
+        above.dedup_by_key(|(structure, ..)| *structure);
+        for (structure, value, atom) in above {
+            let (index, version) = (structure as usize, mixture.component(place(atom)).updates);
+            self.largest[index] = atom;
+            self.bounds.push(Bound { value, preference: 0.0, index, version });
         }
         Ok(())
     }

@@ -21,33 +21,22 @@ pub(super) struct Bound {
 
 /// Bounds, the largest of which is at hand.
 #[derive(Debug, Default)]
-pub(super) struct LazyHeap {
-    /// Those that were known at the start, ascending.
-    sorted: Vec<Bound>,
-    /// Those that were added.
-    added: BinaryHeap<Bound>,
-}
+pub(super) struct LazyHeap(BinaryHeap<Bound>);
 
 impl LazyHeap {
-    /// Begins with some bounds. To sort many costs less than to take them from a heap.
-    pub fn new(mut bounds: Vec<Bound>) -> Self {
-        bounds.sort_unstable();
-        Self { sorted: bounds, added: BinaryHeap::new() }
-    }
-
     /// Adds a bound.
     pub fn push(&mut self, bound: Bound) {
-        self.added.push(bound);
+        self.0.push(bound);
     }
 
     /// Removes the largest bound.
     pub fn pop(&mut self) -> Option<Bound> {
-        if self.added.peek() > self.sorted.last() { self.added.pop() } else { self.sorted.pop() }
+        self.0.pop()
     }
 
     /// The largest bound.
     pub fn largest(&self) -> Option<Bound> {
-        self.added.peek().max(self.sorted.last()).copied()
+        self.0.peek().copied()
     }
 
     /// Removes bounds that are out of date and larger than all that are up to date, at most `count`, and returns their indices, the
@@ -57,13 +46,13 @@ impl LazyHeap {
     pub fn take_outdated(&mut self, count: usize, version: impl Fn(usize) -> Option<usize>) -> Vec<usize> {
         let mut outdated = Vec::new();
         while outdated.len() < count
-            && let Some(top) = self.largest()
+            && let Some(&top) = self.0.peek()
         {
             let present = version(top.index);
             if present == Some(top.version) {
                 break;
             }
-            self.pop();
+            self.0.pop();
             if present.is_some() {
                 outdated.push(top.index);
             }
@@ -102,22 +91,12 @@ mod tests {
 
     #[test]
     fn the_largest_bounds_come_first_and_outdated_ones_are_taken_out() {
-        let values = [(1.0, 0.0), (3.0, 1.0), (3.0, 2.0), (2.0, 0.0), (2.0, 0.0), (4.0, 0.0)];
-        let bounds = values.into_iter().enumerate().map(|(index, (value, preference))| Bound {
-            value,
-            preference,
-            index,
-            version: index % 2,
-        });
-        let bounds: Vec<Bound> = bounds.collect();
-        for known in 0..=bounds.len() {
-            let mut heap = LazyHeap::new(bounds[..known].to_vec());
-            bounds[known..].iter().for_each(|bound| heap.push(*bound));
-            the_largest_are_taken_out(heap);
+        let mut heap = LazyHeap::default();
+        for (index, (value, preference)) in
+            [(1.0, 0.0), (3.0, 1.0), (3.0, 2.0), (2.0, 0.0), (2.0, 0.0), (4.0, 0.0)].into_iter().enumerate()
+        {
+            heap.push(Bound { value, preference, index, version: index % 2 });
         }
-    }
-
-    fn the_largest_are_taken_out(mut heap: LazyHeap) {
         // Index 5 counts no longer; 2 and 1 are out of date, 3 is not.
         let version = |index: usize| [Some(0), Some(7), Some(7), Some(1), Some(7), None][index];
         assert_eq!(heap.take_outdated(1, version), [2]);

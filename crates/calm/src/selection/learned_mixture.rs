@@ -134,21 +134,31 @@ impl LearnedMixture {
         Ok(Learned { alpha, gamma_max: update.gamma_max })
     }
 
-    /// The update with the smallest α that brings γ below the target, or with the largest.
+    /// The update with the smallest α that brings γ below the target, or with the largest. γ only falls with α, so bisection finds it.
     fn smallest_alpha(&self, groups: &[ComponentAtoms]) -> Result<(f64, Update), SelectionError> {
         let alphas: Vec<f64> = CovarianceUpdateKind::Additive.default_alphas().into();
+        let largest = alphas.len() - 1;
         let mut found = (0.0, Update::default());
-        for (number, &alpha) in alphas.iter().enumerate() {
-            let limit = if number + 1 < alphas.len() { self.target } else { f64::INFINITY };
+        // For most structures the first is enough.
+        let (mut least, mut tried, mut enough) = (0, 0, alphas.len());
+        while least < enough {
+            let alpha = alphas[tried];
             let added = |k: usize| {
                 let ComponentAtoms { place, covariance, .. } = &groups[k];
                 let old = &self.components[*place].covariance.matrix;
                 old.iter().zip(covariance).map(|(old, new)| old + alpha * new).collect()
             };
-            found = (alpha, self.update(groups, limit, added)?);
-            if found.1.gamma_max < self.target {
-                break;
+            let limit = if tried < largest { self.target } else { f64::INFINITY };
+            let update = self.update(groups, limit, added)?;
+            if update.gamma_max < self.target {
+                enough = tried;
+            } else {
+                least = tried + 1;
             }
+            if enough == tried || tried == largest {
+                found = (alpha, update);
+            }
+            tried = (least + enough) / 2;
         }
         Ok(found)
     }
