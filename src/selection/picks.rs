@@ -1,10 +1,8 @@
 //! Applies strategies, one after another, each to what is left.
 
 use calm::Mixture;
-use calm::rules::{Positive, UpdateSettings};
-use calm::selection::{
-    DOptimal, FarthestPoints, Greedy, Metric, SelectionError, floors, random_structures, update_settings,
-};
+use calm::rules::Positive;
+use calm::selection::{DOptimal, FarthestPoints, Greedy, Metric, SelectionError, floors, random_structures};
 use tokio_util::sync::CancellationToken;
 
 use super::GradedPool;
@@ -53,7 +51,6 @@ pub fn pick(
     rules: &Rules,
     stop: &CancellationToken,
 ) -> Result<Option<Picks>, CommandError> {
-    let settings = update_settings(rules.update_target);
     let mut picks: Vec<Pick> = Vec::new();
     let mut left = None;
     for (part, quota) in (0..).zip(&rules.parts) {
@@ -67,7 +64,7 @@ pub fn pick(
             stop,
         };
         let (found, largest_left) = match strategy {
-            Strategy::Greedy => run.greedy(settings.clone())?,
+            Strategy::Greedy => run.greedy(rules.update_target)?,
             Strategy::FarthestPoints => (run.farthest_points(Metric::Whitened(mixture))?, None),
             Strategy::FarthestPointsAll => (run.farthest_points(Metric::Plain)?, None),
             Strategy::DOptimal => (run.d_optimal()?, None),
@@ -86,7 +83,7 @@ pub fn pick(
     };
     let gamma_left = match left {
         Some(left) => Some(left),
-        None => gamma_left(pool, mixture, settings, &picks)?,
+        None => gamma_left(pool, mixture, rules.update_target, &picks)?,
     };
     Ok(Some(Picks { picks, short, gamma_left }))
 }
@@ -106,8 +103,8 @@ struct StrategyRun<'a> {
 
 impl StrategyRun<'_> {
     /// The picks, and the largest γ that is left (0: none is above the lower limit).
-    fn greedy(&self, settings: UpdateSettings) -> Result<(Vec<Pick>, Option<f64>), CommandError> {
-        let mut greedy = Greedy::new(&self.pool.pool, self.mixture, settings, self.picked.iter().copied())
+    fn greedy(&self, target: Positive) -> Result<(Vec<Pick>, Option<f64>), CommandError> {
+        let mut greedy = Greedy::new(&self.pool.pool, self.mixture, target, self.picked.iter().copied())
             .map_err(CommandError::failed)?;
         let picks = self.collect(|| {
             let found = greedy.pick()?;
@@ -188,13 +185,13 @@ fn meet_floors(pool: &GradedPool, picks: &mut Vec<Pick>, floor: u64, left: &mut 
 fn gamma_left(
     pool: &GradedPool,
     mixture: &Mixture,
-    settings: UpdateSettings,
+    target: Positive,
     picks: &[Pick],
 ) -> Result<Option<f64>, CommandError> {
     if !mixture.can_be_updated() {
         return Ok(None);
     }
     let picked = picks.iter().map(|pick| pick.structure);
-    let mut greedy = Greedy::new(&pool.pool, mixture, settings, picked).map_err(CommandError::failed)?;
+    let mut greedy = Greedy::new(&pool.pool, mixture, target, picked).map_err(CommandError::failed)?;
     Ok(Some(greedy.gamma_left().map_err(CommandError::failed)?.unwrap_or_default()))
 }

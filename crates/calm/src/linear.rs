@@ -167,10 +167,23 @@ pub(crate) fn pseudo_inverse_with_spectrum(matrix: &[f64], dimension: usize) -> 
 /// # Errors
 /// Those of [`pseudo_inverse`].
 pub fn regularised_inverse(covariance: &[f64], dimension: usize) -> Result<Vec<f64>, LinearError> {
+    match regularised_factor(covariance, dimension)? {
+        Some(factor) => Ok(inverse_of(&factor)),
+        None => pseudo_inverse(&regularised(covariance, dimension), dimension),
+    }
+}
+
+/// L of C + εI = LLᵀ; `None` if an eigenvalue is not positive or could be so small that the pseudo-inverse drops it.
+///
+/// # Errors
+/// A wrong length, an element that is not finite.
+pub(crate) fn regularised_factor(
+    covariance: &[f64],
+    dimension: usize,
+) -> Result<Option<Mat<f64>>, LinearError> {
     check(covariance, dimension)?;
     let matrix = regularised(covariance, dimension);
-    let factor = if is_positive(trace(&matrix, dimension)) { cholesky(&matrix, dimension) } else { None };
-    factor.map_or_else(|| pseudo_inverse(&matrix, dimension), |factor| Ok(inverse_of(&factor)))
+    Ok(if is_positive(trace(&matrix, dimension)) { cholesky(&matrix, dimension) } else { None })
 }
 
 /// Whether no eigenvalue of a regularised covariance with this trace can be so small that the pseudo-inverse

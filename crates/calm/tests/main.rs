@@ -7,6 +7,7 @@ mod baselines;
 mod build;
 mod forgetting;
 mod grade;
+mod greedy;
 mod properties;
 mod rules;
 mod selection;

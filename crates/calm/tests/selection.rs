@@ -1,14 +1,12 @@
-//! The lazy selections against complete evaluations after each pick.
+//! Farthest points and D-optimal picks against complete evaluations after each pick.
 
 use std::sync::Arc;
 
 use calm::build::shuffled;
 use calm::grade::maximum;
 use calm::rules::Positive;
-use calm::selection::{
-    DOptimal, FarthestPoints, Greedy, Metric, Pool, PoolAtom, SelectionError, Window, update_settings,
-};
-use calm::{Component, Grades, Mixture, Statistics, UpdateError, regularised_inverse, update};
+use calm::selection::{DOptimal, FarthestPoints, Greedy, Metric, Pool, PoolAtom, SelectionError, Window};
+use calm::{Component, Grades, Mixture, Statistics, UpdateError, regularised_inverse};
 use proptest::prelude::*;
 
 use crate::common::{Random, niobium};
@@ -68,37 +66,6 @@ impl Structures {
         let kept = (0..elements.len()).filter(|&atom| WINDOW.has(grades.gamma[atom]));
         let kept: Vec<_> = kept.map(|atom| (elements[atom], &features[atom * D..][..D])).collect();
         (kept.iter().map(|(e, _)| *e).collect(), kept.iter().flat_map(|(_, z)| z.to_vec()).collect())
-    }
-
-    /// All γ_max after each pick, from the definition.
-    fn complete_greedy(&self, before: &[usize]) -> Vec<(usize, f64)> {
-        let (mut mixture, settings) = (self.mixture.clone(), update_settings(target()));
-        let mut left: Vec<usize> = (0..self.structures.len()).filter(|s| !before.contains(s)).collect();
-        let learn = |mixture: &mut Mixture, structure: usize| {
-            let (elements, features) = self.within(structure);
-            if !elements.is_empty() {
-                let outcome = update(mixture, &elements, &features, &settings).unwrap();
-                *mixture = mixture.with_changes(&outcome.changed).unwrap();
-            }
-        };
-        before.iter().for_each(|&structure| learn(&mut mixture, structure));
-        let mut picks = Vec::new();
-        loop {
-            let gamma = |&structure: &usize| {
-                let (elements, features) = self.within(structure);
-                let mut grades = Grades::default();
-                grades.evaluate(&mixture, &elements, &features, None).unwrap();
-                maximum(&grades.gamma)
-            };
-            let gamma: Vec<f64> = left.iter().map(gamma).collect();
-            let largest = maximum(&gamma);
-            if largest <= WINDOW.above {
-                return picks;
-            }
-            let structure = left.remove(gamma.iter().position(|g| *g == largest).unwrap());
-            picks.push((structure, largest));
-            learn(&mut mixture, structure);
-        }
     }
 
     /// Atoms within the window as (structure, group, whitened features).
@@ -217,40 +184,12 @@ fn complete_farthest(
     picks
 }
 
-fn target() -> Positive {
-    1.25_f64.try_into().unwrap()
-}
-
 fn picked(found: &[(usize, f64)]) -> Vec<usize> {
     found.iter().map(|(structure, _)| *structure).collect()
 }
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
-
-    #[test]
-    fn greedy_picks_as_after_a_complete_grading(seed in 0_u64..1000, before in 0_usize..4, memory in 0_usize..9000) {
-        let case = structures(seed, 30, false, memory);
-        let before: Vec<usize> = shuffled(seed, 0, 30).into_iter().take(before).collect();
-        let expected = case.complete_greedy(&before);
-        let mut greedy =
-            Greedy::new(&case.pool, &case.mixture, update_settings(target()), before.iter().copied()).unwrap();
-        let mut found = Vec::new();
-        loop {
-            let left = greedy.gamma_left().unwrap();
-            let Some(pick) = greedy.pick().unwrap() else {
-                prop_assert_eq!(left, None);
-                break;
-            };
-            prop_assert_eq!(left, Some(pick.gamma_max));
-            prop_assert!(pick.gamma_after < 1.25 && pick.alpha > 0.0);
-            found.push((pick.structure, pick.gamma_max));
-        }
-        prop_assert_eq!(picked(&found), picked(&expected));
-        for ((_, gamma), (_, expected)) in found.iter().zip(&expected) {
-            prop_assert!((gamma - expected).abs() <= 1e-9 * expected);
-        }
-    }
 
     #[test]
     fn farthest_points_are_those_of_all_distances(seed in 0_u64..1000, before in 1_usize..4, memory in 0_usize..9000) {
@@ -373,7 +312,8 @@ fn a_mixture_without_statistics_cannot_be_updated() {
         elements
     });
     let mixture = Mixture::new(0, stripped).unwrap();
-    let greedy = Greedy::new(&case.pool, &mixture, update_settings(target()), []).map(drop);
+    let target: Positive = 1.25.try_into().unwrap();
+    let greedy = Greedy::new(&case.pool, &mixture, target, []).map(drop);
     for found in [greedy, DOptimal::new(&case.pool, &mixture, []).map(drop)] {
         let error = found.unwrap_err();
         assert!(matches!(error, SelectionError::Update(UpdateError::NoStatistics { .. })), "{error}");

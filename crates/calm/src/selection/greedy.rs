@@ -1,42 +1,41 @@
 //! The structure with the largest γ first, with an update of a copy of the mixture after each pick.
 
-use std::collections::HashMap;
-use std::sync::Arc;
-
 use super::SelectionError;
 use super::lazy_heap::{Bound, LazyHeap};
-use super::pool::{Pool, PoolAtom};
-use crate::component::Statistics;
-use crate::grade::{GradeError, Grades, maximum};
-use crate::mixture::{ChangedComponent, Mixture};
-use crate::rules::{CovarianceUpdateKind, MaximumGradeUpdate, Positive, UpdateRule, UpdateSettings};
-use crate::search::update;
-use crate::update::UpdateError;
+use super::learned_mixture::{Learned, LearnedMixture};
+use super::pool::Pool;
+use crate::mixture::Mixture;
+use crate::rules::Positive;
 
-/// Atoms that are graded together.
-const BATCH: usize = 16;
-/// Atoms of a batch of the first grading.
-const FIRST_BATCH: usize = 1024;
+/// Atoms whose features are in the cache together.
+const GRADED_TOGETHER: usize = 64;
+
+/// Version of a bound that is no γ of this copy of the mixture.
+const NOT_GRADED: usize = usize::MAX;
 
 /// Picks structures by the largest γ of their atoms within the window. After each pick, the additive update C ← C + αC_b of a copy
 /// of the mixture learns the structure, where C_b is that of its atoms within the window and α the smallest that brings their γ
 /// below the target, if need be with an inflation.
 ///
 /// Centroids, thresholds and the assignment of atoms do not change. C + αC_b ≥ C in the Loewner order (C_b is positive
-/// semidefinite), as is an inflation, so (C′ + εI)⁻¹ ≤ (C + εI)⁻¹ and no γ rises. The γ of an atom from before an update is
-/// therefore an upper bound, and only atoms whose bound is the largest are graded again: the picks are those of a complete grading
-/// after each pick.
+/// semidefinite), as is an inflation, so (C′ + εI)⁻¹ ≤ (C + εI)⁻¹ and no γ rises. The largest γ of a structure from before an update
+/// is therefore an upper bound, and only structures whose bound is the largest are graded again: the picks are those of a complete
+/// grading after each pick. All atoms of a structure are graded at once, because their features are side by side in memory; those that
+/// are not above the lower limit of the window never are again.
+///
+/// The inverses of the copy follow from its covariances. Those of the given mixture may come from an artifact in single precision, so
+/// the first bounds are its γ with a factor that covers the difference.
 #[derive(Debug)]
 pub struct Greedy<'a> {
     pool: &'a Pool,
-    mixture: Mixture,
-    settings: UpdateSettings,
-    /// Number of updates of each component that has had one.
-    versions: Versions,
-    /// Of the γ of atoms.
+    mixture: LearnedMixture,
+    /// Of the largest γ of structures. Their version is the number of updates of the component of that atom.
     bounds: LazyHeap,
+    /// The atom with the largest γ when a structure was graded, `[structures]`.
+    largest: Vec<usize>,
     taken: Vec<bool>,
-    grades: Grades,
+    /// Atoms that are no longer above the lower limit of the window, `[atoms]`.
+    covered: Vec<bool>,
 }
 
 /// A structure that was picked.
@@ -52,49 +51,34 @@ pub struct GreedyPick {
     pub alpha: f64,
 }
 
-/// Number of updates of components, by element and slot.
-type Versions = HashMap<(usize, usize), usize>;
-
-/// The additive update until γ_max is below `target` (default of the walkers' update: 1.25).
-pub fn update_settings(target: Positive) -> UpdateSettings {
-    UpdateSettings {
-        covariance_update: CovarianceUpdateKind::Additive,
-        alpha_values: None,
-        stop: UpdateRule::MaximumGrade(MaximumGradeUpdate { target }),
-    }
-}
-
 impl<'a> Greedy<'a> {
-    /// Prepares the picks. The copy of `mixture` is updated with the structures that were `picked` before, in their order, and
-    /// these are not picked again.
-    ///
-    /// The inverses of the copy follow from its covariances, as after an update: those of an artifact in single precision would
-    /// make some γ rise at the first update.
+    /// Prepares the picks. `mixture` is the one that graded the pool. A copy of it is updated with the structures that were `picked`
+    /// before, in their order, and these are not picked again. An update brings γ below `target` (default of the walkers' update:
+    /// 1.25).
     ///
     /// # Errors
     /// A mixture without statistics, a pool that belongs to another mixture, a file that cannot be read.
     pub fn new(
         pool: &'a Pool,
         mixture: &Mixture,
-        settings: UpdateSettings,
+        target: Positive,
         picked: impl IntoIterator<Item = usize>,
     ) -> Result<Self, SelectionError> {
         let mut greedy = Self {
             pool,
-            mixture: consistent(mixture, pool)?,
-            settings,
-            versions: Versions::new(),
+            mixture: LearnedMixture::new(mixture, pool, target.into())?,
             bounds: LazyHeap::default(),
+            largest: vec![0; pool.len()],
             taken: vec![false; pool.len()],
-            grades: Grades::default(),
+            covered: vec![false; pool.atoms().len()],
         };
         for structure in picked {
             greedy.learn(structure)?;
         }
-        let atoms: Vec<usize> =
-            (0..pool.len()).filter(|&s| !greedy.taken[s]).flat_map(|s| pool.window_atoms_of(s)).collect();
-        for atoms in atoms.chunks(FIRST_BATCH) {
-            greedy.grade(atoms)?;
+        for structure in 0..pool.len() {
+            if !greedy.taken[structure] {
+                greedy.add(structure);
+            }
         }
         Ok(greedy)
     }
@@ -104,10 +88,9 @@ impl<'a> Greedy<'a> {
     /// # Errors
     /// Those of [`Self::new`].
     pub fn pick(&mut self) -> Result<Option<GreedyPick>, SelectionError> {
-        let Some(Bound { value: gamma, index: atom, .. }) = self.largest()? else { return Ok(None) };
-        let structure = self.pool.atoms()[atom].structure as usize;
-        let (alpha, gamma_after) = self.learn(structure)?.unwrap_or_default();
-        Ok(Some(GreedyPick { structure, gamma_max: gamma, gamma_after, alpha }))
+        let Some(Bound { value: gamma, index: structure, .. }) = self.largest()? else { return Ok(None) };
+        let Learned { alpha, gamma_max } = self.learn(structure)?;
+        Ok(Some(GreedyPick { structure, gamma_max: gamma, gamma_after: gamma_max, alpha }))
     }
 
     /// Largest γ of an atom within the window in a structure that was not picked, under the updated mixture; `None` if none is
@@ -119,12 +102,25 @@ impl<'a> Greedy<'a> {
         Ok(self.largest()?.map(|bound| bound.value))
     }
 
-    /// The atom with the largest γ, which stays in the queue.
+    /// Puts a structure with its first bound into the queue, if it has an atom within the window.
+    fn add(&mut self, structure: usize) {
+        let bounds = self.pool.window_atoms_of(structure).map(|atom| {
+            let atom = &self.pool.atoms()[atom];
+            self.mixture.component(self.mixture.place(atom)).bound_factor * atom.gamma
+        });
+        if let Some(value) = bounds.reduce(f64::max) {
+            self.bounds.push(Bound { value, preference: 0.0, index: structure, version: NOT_GRADED });
+        }
+    }
+
+    /// The structure with the largest γ, which stays in the queue.
     fn largest(&mut self) -> Result<Option<Bound>, SelectionError> {
+        // Small structures several at a time.
+        let structures = GRADED_TOGETHER * self.pool.len() / self.pool.atoms().len().max(1);
         loop {
-            let outdated = self.bounds.take_outdated(BATCH, |atom| {
-                let atom = &self.pool.atoms()[atom];
-                (!self.taken[atom.structure as usize]).then(|| version(&self.versions, atom))
+            let outdated = self.bounds.take_outdated(structures.max(1), |structure| {
+                let place = self.mixture.place(&self.pool.atoms()[self.largest[structure]]);
+                (!self.taken[structure]).then(|| self.mixture.component(place).updates)
             });
             if outdated.is_empty() {
                 return Ok(self.bounds.largest());
@@ -133,56 +129,38 @@ impl<'a> Greedy<'a> {
         }
     }
 
-    /// Grades atoms and puts those above the lower limit into the queue. The others never rise above it again.
-    fn grade(&mut self, atoms: &[usize]) -> Result<(), SelectionError> {
-        let (elements, features) = self.pool.read(atoms.iter().copied())?;
-        self.grades.evaluate(&self.mixture, &elements, &features, None)?;
-        for (&value, &index) in self.grades.gamma.iter().zip(atoms) {
-            if value > self.pool.window().above {
-                let version = version(&self.versions, &self.pool.atoms()[index]);
-                self.bounds.push(Bound { value, preference: 0.0, index, version });
+    /// Grades structures and puts those with an atom above the lower limit of the window into the queue.
+    fn grade(&mut self, structures: &[usize]) -> Result<(), SelectionError> {
+        let (pool, mixture) = (self.pool, &self.mixture);
+        let place = |atom: usize| mixture.place(&pool.atoms()[atom]);
+        let atoms = structures.iter().flat_map(|structure| pool.window_atoms_of(*structure));
+        let mut atoms: Vec<usize> = atoms.filter(|atom| !self.covered[*atom]).collect();
+        atoms.sort_unstable_by_key(|&atom| (place(atom), atom));
+        let mut above = Vec::new();
+        let groups = atoms.chunk_by(|&a, &b| place(a) == place(b));
+        for atoms in groups.flat_map(|group| group.chunks(GRADED_TOGETHER)) {
+            let gamma = mixture.component(place(atoms[0])).gamma(pool, atoms)?;
+            for (&atom, gamma) in atoms.iter().zip(gamma) {
+                self.covered[atom] = gamma <= pool.window().above;
+                if !self.covered[atom] {
+                    above.push((pool.atoms()[atom].structure, gamma, atom));
+                }
             }
+        }
+        above.sort_unstable_by(|a, b| a.0.cmp(&b.0).then_with(|| b.1.total_cmp(&a.1)));
+        // The first of each structure is the largest.
+        above.dedup_by_key(|(structure, ..)| *structure);
+        for (structure, value, atom) in above {
+            let (index, version) = (structure as usize, mixture.component(place(atom)).updates);
+            self.largest[index] = atom;
+            self.bounds.push(Bound { value, preference: 0.0, index, version });
         }
         Ok(())
     }
 
-    /// Updates the mixture with the atoms of a structure within the window. Returns α and γ_max after it; `None` without atoms.
-    fn learn(&mut self, structure: usize) -> Result<Option<(f64, f64)>, SelectionError> {
+    /// Updates the mixture with the atoms of a structure within the window.
+    fn learn(&mut self, structure: usize) -> Result<Learned, SelectionError> {
         self.taken[structure] = true;
-        let (elements, features) = self.pool.read(self.pool.window_atoms_of(structure))?;
-        if elements.is_empty() {
-            return Ok(None);
-        }
-        let outcome = update(&self.mixture, &elements, &features, &self.settings)?;
-        self.mixture = self.mixture.with_changes(&outcome.changed)?;
-        for ChangedComponent { element, slot, .. } in outcome.changed {
-            *self.versions.entry((element, slot)).or_default() += 1;
-        }
-        Ok(Some((outcome.alpha, maximum(&outcome.gamma_after))))
+        self.mixture.learn(self.pool, self.pool.window_atoms_of(structure).collect())
     }
-}
-
-/// Number of updates of the component of an atom.
-fn version(versions: &Versions, atom: &PoolAtom) -> usize {
-    versions.get(&(atom.element.into(), atom.slot.into())).copied().unwrap_or_default()
-}
-
-/// The mixture with inverses that follow from its covariances, for the components that atoms of the pool belong to.
-fn consistent(mixture: &Mixture, pool: &Pool) -> Result<Mixture, SelectionError> {
-    let mut places: Vec<(usize, usize)> =
-        pool.atoms().iter().map(|atom| (atom.element.into(), atom.slot.into())).collect();
-    places.sort_unstable();
-    places.dedup();
-    let mut changed = Vec::new();
-    for (element, slot) in places {
-        let unknown = GradeError::Element { atom: 0, element, elements: mixture.element_count() };
-        let component = mixture.component(element, slot).ok_or(unknown)?;
-        let statistics = component.statistics().ok_or(UpdateError::NoStatistics { element, slot })?;
-        let &Statistics { count, effective_count, .. } = statistics;
-        let component = component
-            .with_covariance(&statistics.covariance(), count, effective_count)
-            .map_err(|source| SelectionError::Linear { element, slot, source })?;
-        changed.push(ChangedComponent { element, slot, component: Arc::new(component) });
-    }
-    Ok(mixture.with_changes(&changed)?)
 }

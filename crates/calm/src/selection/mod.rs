@@ -12,14 +12,16 @@ mod d_optimal;
 mod farthest_points;
 pub mod floors;
 mod greedy;
+mod inverse_factor;
 mod lazy_heap;
+mod learned_mixture;
 mod pool;
 mod random;
 mod rows;
 
 pub use d_optimal::{DOptimal, DOptimalPick};
 pub use farthest_points::{FarthestPoint, FarthestPoints, Metric};
-pub use greedy::{Greedy, GreedyPick, update_settings};
+pub use greedy::{Greedy, GreedyPick};
 pub use pool::{Pool, PoolAtom, Window};
 pub use random::random_structures;
 pub use rows::FeatureRows;
@@ -28,7 +30,6 @@ use std::io;
 
 use crate::grade::GradeError;
 use crate::linear::LinearError;
-use crate::mixture::MixtureError;
 use crate::update::UpdateError;
 
 /// Why a selection failed.
@@ -40,9 +41,6 @@ pub enum SelectionError {
     /// Features that cannot be graded.
     #[error(transparent)]
     Grade(#[from] GradeError),
-    /// A component that does not belong to the mixture.
-    #[error(transparent)]
-    Mixture(#[from] MixtureError),
     /// A covariance that cannot be inverted.
     #[error("covariance of component {slot} of element {element}: {source}")]
     Linear {

@@ -118,16 +118,15 @@ impl Pool {
         self.atoms_of(structure).filter(|&atom| self.window.has(self.atoms[atom].gamma))
     }
 
-    /// Element index and features of some atoms, one after another.
+    /// Features of some atoms, one after another, `[atoms × D]`.
     ///
     /// # Errors
     /// A temporary file that cannot be read.
-    pub fn read(&self, atoms: impl IntoIterator<Item = usize>) -> io::Result<(Vec<usize>, Vec<f64>)> {
-        let (mut elements, mut features) = (Vec::new(), Vec::new());
-        for atom in atoms {
-            elements.push(usize::from(self.atoms[atom].element));
+    pub fn features_of(&self, atoms: &[usize]) -> io::Result<Vec<f64>> {
+        let mut features = Vec::with_capacity(atoms.len() * self.features.dimension());
+        for &atom in atoms {
             self.features.read(atom..atom + 1, &mut features)?;
         }
-        Ok((elements, features))
+        Ok(features)
     }
 }
