@@ -1,5 +1,8 @@
 //! Confidence intervals by resampling.
 
+use std::panic::resume_unwind;
+use std::thread::{self, available_parallelism};
+
 use crate::quantiles::quantile;
 use crate::random::Draw;
 
@@ -23,6 +26,25 @@ impl Bootstrap {
         let (draw, mut counts) = (Draw::new(self.seed, draw), vec![0; units]);
         (0..units).for_each(|index| counts[draw.below(index, units)] += 1);
         counts
+    }
+
+    /// The interval of each of the statistics that `draw` computes from the number of a draw, as [`Self::interval`]. All cores of this
+    /// host share the draws; the result does not depend on their number.
+    pub fn intervals(&self, draw: impl Fn(u32) -> Vec<Option<f64>> + Sync) -> Vec<Option<(f64, f64)>> {
+        let threads = available_parallelism().map_or(1, |cores| cores.get()).min(self.draws as usize).max(1);
+        let share = |first: usize| -> Vec<Vec<Option<f64>>> {
+            (first..self.draws as usize).step_by(threads).map(|number| draw(number as u32)).collect()
+        };
+        let share = &share;
+        // The order of the draws has no meaning.
+        let draws: Vec<Vec<Option<f64>>> = thread::scope(|scope| {
+            let threads: Vec<_> = (0..threads).map(|first| scope.spawn(move || share(first))).collect();
+            let results = threads.into_iter().map(|thread| thread.join());
+            results.flat_map(|draws| draws.unwrap_or_else(|panic| resume_unwind(panic))).collect()
+        });
+        let number = draws.first().map_or(0, Vec::len);
+        let interval = |k| self.interval(&draws.iter().map(|values| values[k]).collect::<Vec<_>>());
+        (0..number).map(interval).collect()
     }
 
     /// The interval from the statistic's values over all draws, each `None` where the statistic is not defined.
@@ -65,6 +87,15 @@ mod tests {
         assert_eq!(NINETY.interval(&[Some(1.0), None]), None);
         assert_eq!(NINETY.interval(&[Some(1.0), Some(1.0), None]), Some((1.0, 1.0)));
         assert_eq!(NINETY.interval(&[]), None);
+    }
+
+    #[test]
+    fn intervals_are_those_of_each_statistic() {
+        let values = |draw: u32| vec![Some(f64::from(draw)), (draw % 4 == 0).then_some(1.0), Some(7.0)];
+        let first: Vec<_> = (0..NINETY.draws).map(|draw| Some(f64::from(draw))).collect();
+        let expected = [NINETY.interval(&first), None, Some((7.0, 7.0))];
+        assert_eq!(NINETY.intervals(values), expected);
+        assert!(Bootstrap { draws: 0, ..NINETY }.intervals(values).is_empty());
     }
 
     /// Two standard normal numbers.
