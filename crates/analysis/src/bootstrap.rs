@@ -3,6 +3,7 @@
 use std::panic::resume_unwind;
 use std::thread::{self, available_parallelism};
 
+use crate::normal_tail::two_sided_normal_tail;
 use crate::quantiles::quantile;
 use crate::random::Draw;
 
@@ -26,6 +27,16 @@ impl Bootstrap {
         let (draw, mut counts) = (Draw::new(self.seed, draw), vec![0; units]);
         (0..units).for_each(|index| counts[draw.below(index, units)] += 1);
         counts
+    }
+
+    /// The same with the percentiles moved outwards for a small number of units: those at Φ(∓√(n/(n − 1)) t) with the quantile t of
+    /// Student's distribution with n − 1 degrees of freedom (expanded percentiles: Hesterberg, The American Statistician 69
+    /// (2015) 371, section 5.2). Plain percentiles cover too little: a draw of n units has a variance that is smaller by (n − 1)/n, and
+    /// they take the place of a normal distribution. `units` must be at least 5, below which the expansion of t has no meaning.
+    pub fn expanded(&self, units: usize) -> Self {
+        let freedom = units.max(5) as f64 - 1.0;
+        let t = student_quantile(normal_quantile(1.0 - self.level), freedom);
+        Self { level: 1.0 - two_sided_normal_tail(((freedom + 1.0) / freedom).sqrt() * t), ..*self }
     }
 
     /// The interval of each of the statistics that `draw` computes from the number of a draw, as [`Self::interval`]. All cores of this
@@ -58,6 +69,28 @@ impl Bootstrap {
         let tail = 0.5 * (1.0 - self.level);
         quantile(&known, tail).zip(quantile(&known, 1.0 - tail))
     }
+}
+
+/// The z with P(|Z| ≥ z) = `tail` of a standard normal Z, for tails above 10⁻²⁰.
+fn normal_quantile(tail: f64) -> f64 {
+    let (mut low, mut high) = (0.0, 10.0);
+    for _ in 0..60 {
+        let middle = 0.5 * (low + high);
+        if two_sided_normal_tail(middle) > tail { low = middle } else { high = middle }
+    }
+    low
+}
+
+/// The quantile of Student's distribution where the normal distribution has `x` (Abramowitz & Stegun 26.7.5).
+fn student_quantile(x: f64, freedom: f64) -> f64 {
+    let terms = [
+        (x.powi(3) + x) / 4.0,
+        (5.0 * x.powi(5) + 16.0 * x.powi(3) + 3.0 * x) / 96.0,
+        (3.0 * x.powi(7) + 19.0 * x.powi(5) + 17.0 * x.powi(3) - 15.0 * x) / 384.0,
+        (79.0 * x.powi(9) + 776.0 * x.powi(7) + 1482.0 * x.powi(5) - 1920.0 * x.powi(3) - 945.0 * x)
+            / 92160.0,
+    ];
+    terms.iter().rev().fold(0.0, |sum, term| (sum + term) / freedom) + x
 }
 
 #[cfg(test)]
@@ -96,6 +129,21 @@ mod tests {
         let expected = [NINETY.interval(&first), None, Some((7.0, 7.0))];
         assert_eq!(NINETY.intervals(values), expected);
         assert!(Bootstrap { draws: 0, ..NINETY }.intervals(values).is_empty());
+    }
+
+    /// 1 - 2 * norm.cdf(-sqrt(n / (n - 1)) * t.ppf(0.5 + level / 2, n - 1)), SciPy 1.17.
+    #[test]
+    fn few_units_take_wider_percentiles() {
+        for (units, level, expected) in [
+            (10, 0.9, 0.946_673_9),
+            (10, 0.95, 0.982_898_7),
+            (12, 0.95, 0.978_486_8),
+            (40, 0.9, 0.912_055_1),
+            (1000, 0.95, 0.950_391_4),
+        ] {
+            let found = Bootstrap { level, ..NINETY }.expanded(units).level;
+            assert!((found - expected).abs() < 1e-6, "{units} {level}: {found}");
+        }
     }
 
     /// Two standard normal numbers.
