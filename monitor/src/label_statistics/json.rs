@@ -19,7 +19,6 @@ pub(super) fn to_json(protocol: &Protocol, statistics: &LabelStatistics) -> Valu
         "shared_structures": statistics.shared,
         "completion_by_gamma": completion_as_json(&statistics.by_gamma.bins()),
         "completion_by_relative_volume": completion_as_json(&statistics.by_expansion.bins()),
-        "biased_against_control": statistics.comparison(),
     });
     if let Some(version) = statistics.version {
         json["version"] = version.into();

@@ -119,7 +119,7 @@ impl LabelStatistics {
         WalkComparison::new(&self.compared, COMPARISON_BOOTSTRAP)
     }
 
-    /// The JSON of `calmwalk force-errors`, for labels of this protocol, without sentences. It has [`Self::comparison`].
+    /// The JSON of `calmwalk force-errors`, for labels of this protocol, without sentences and without [`Self::comparison`].
     pub fn to_json(&self, protocol: &Protocol) -> Value {
         json::to_json(protocol, self)
     }
