@@ -11,12 +11,21 @@ use crate::output::{count, decimals};
 pub fn notes(comparison: &WalkComparison) -> Vec<String> {
     let mut notes = vec![pairs(&comparison.pairs)];
     notes.extend(left_out(&comparison.pairs.counts));
-    if comparison.pairs.counts.pairs > 0 {
-        notes.push(format!("matched: {}", intervals(&comparison.pairs.units, comparison)));
+    let has_pairs = comparison.pairs.counts.pairs > 0;
+    let matched = intervals(&comparison.pairs.units, comparison);
+    let pooled = intervals(&comparison.pooled.all.units, comparison);
+    match has_pairs {
+        true if matched == pooled => notes.push(matched),
+        true => notes.extend([format!("matched: {matched}"), format!("pooled: {pooled}")]),
+        false => notes.push(pooled),
+    }
+    if has_pairs {
         notes.extend(by_unit(&comparison.pairs));
     }
-    if comparison.pooled.all.structures > 0 {
-        notes.push(format!("pooled: {}", intervals(&comparison.pooled.all.units, comparison)));
+    if comparison.pooled.all.units.resampled.is_some() {
+        notes.push(format!(
+            "no interval where fewer than {MIN_UNITS} of the units that the bootstrap draws have the element, or an error above the threshold"
+        ));
     }
     notes.extend(sampled(comparison));
     notes

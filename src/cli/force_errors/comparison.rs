@@ -17,7 +17,8 @@ pub fn write(out: &mut dyn Write, comparison: &WalkComparison) -> io::Result<()>
     }
     writeln!(
         out,
-        "\nbiased against control (matched: a biased candidate and the control frame of the same step; pooled: all labelled structures)"
+        "\nbiased against control (docs/errors.md): matched, a biased candidate and the control frame of the same step; pooled, all \
+         labelled structures"
     )?;
     for note in notes(comparison) {
         writeln!(out, "{note}")?;
@@ -141,7 +142,7 @@ fn write_areas(out: &mut dyn Write, groups: &[(&str, &ComparedGroup)]) -> io::Re
     table.write(out)
 }
 
-/// By element; nothing if all groups have one element.
+/// By element, of matched structures and of all; nothing if all groups have one element.
 fn write_elements(out: &mut dyn Write, groups: &[(&str, &ComparedGroup)]) -> io::Result<()> {
     if groups.iter().all(|(_, group)| group.elements.len() < 2) {
         return Ok(());
@@ -151,6 +152,7 @@ fn write_elements(out: &mut dyn Write, groups: &[(&str, &ComparedGroup)]) -> io:
         TextTable::new(&["element", "", ">atoms", ">median |ΔF| (eV/Å)", ">ρ(γ)", ">ρ(γ_nbr)", &area]);
     let mut numbered: Vec<_> = groups
         .iter()
+        .filter(|(name, _)| name.starts_with("matched") || *name == "pooled all")
         .flat_map(|(name, group)| group.elements.iter().map(move |element| (*name, element)))
         .collect();
     // Stable: the groups of an element stay in order.

@@ -52,7 +52,8 @@ pub struct ComparedGroup {
 pub struct GradeRanking {
     /// Spearman's ρ.
     pub spearman: ConfidenceEstimate,
-    /// ROC-AUC for errors above each of the thresholds.
+    /// ROC-AUC for errors above each of the thresholds. Intervals take [`MIN_UNITS`] resampled units with an error above it, and as
+    /// many with one that is not.
     pub roc_auc: Vec<ConfidenceEstimate>,
 }
 
@@ -107,15 +108,10 @@ impl ComparedGroup {
         let estimates = units.estimates(bootstrap, |all| values(&whole, all), |draw| values(&drawn, draw));
         let mut estimates = estimates.into_iter();
         let median_force_mae = estimates.next().unwrap_or_default();
-        let (median_error, gamma, gamma_nbr) = rankings(&mut estimates, ERROR_THRESHOLDS.len());
+        let (median_error, gamma, gamma_nbr) = rankings(&mut estimates, &drawn.all, &ERROR_THRESHOLDS);
         let element = |(element, (all, drawn)): (&Species, (&RankedAtoms, &RankedAtoms))| {
-            let has_intervals = drawn.units >= MIN_UNITS;
-            let mut of = estimates.by_ref().take(5).map(|estimate| ConfidenceEstimate {
-                interval: estimate.interval.filter(|_| has_intervals),
-                ..estimate
-            });
-            let (median_error, gamma, gamma_nbr) = rankings(&mut of, 1);
-            let (sampled_atoms, units) = (all.len() as u64, all.units);
+            let (median_error, gamma, gamma_nbr) = rankings(&mut estimates, drawn, &[LARGE_FORCE_ERROR]);
+            let (sampled_atoms, units) = (all.len() as u64, all.units());
             ElementRanking { element: element.symbol(), sampled_atoms, units, median_error, gamma, gamma_nbr }
         };
         Self {
@@ -162,15 +158,21 @@ fn thinned<'a>(atoms: &[(&'a ComparedAtom, u32)]) -> Vec<(&'a ComparedAtom, u32)
     sample.items().copied().collect()
 }
 
-/// The next estimates, in the order of [`RankedAtoms::values`] for this number of thresholds.
+/// The next estimates, in the order of [`RankedAtoms::values`] for these thresholds. They keep their intervals where enough units have
+/// any of the atoms `drawn`, and areas where enough units have errors on both sides of the threshold.
 fn rankings(
     estimates: &mut impl Iterator<Item = ConfidenceEstimate>,
-    thresholds: usize,
+    drawn: &RankedAtoms,
+    thresholds: &[f64],
 ) -> (ConfidenceEstimate, GradeRanking, GradeRanking) {
-    let median_error = estimates.next().unwrap_or_default();
+    let mut next = |units: usize| {
+        let estimate = estimates.next().unwrap_or_default();
+        ConfidenceEstimate { interval: estimate.interval.filter(|_| units >= MIN_UNITS), ..estimate }
+    };
+    let median_error = next(drawn.units());
     let mut ranking = || GradeRanking {
-        spearman: estimates.next().unwrap_or_default(),
-        roc_auc: estimates.by_ref().take(thresholds).collect(),
+        spearman: next(drawn.units()),
+        roc_auc: thresholds.iter().map(|threshold| next(drawn.units_on_both_sides(*threshold))).collect(),
     };
     (median_error, ranking(), ranking())
 }

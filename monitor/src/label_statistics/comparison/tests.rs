@@ -149,6 +149,12 @@ fn statistics_are_those_of_scipy() {
         found.matched.biased.mean_temperature.zip(found.matched.control.mean_temperature).map(|(a, b)| a - b),
         500.0,
     );
+    // A single unit with such errors says nothing about other units.
+    let rare = biased.gamma.roc_auc.iter().filter(|area| area.value.is_some() && area.interval.is_none());
+    assert!(
+        rare.count() > 0
+            && all.gamma.roc_auc.iter().all(|area| area.value.is_some() || area.interval.is_none())
+    );
     // Intervals are there and hold the estimates of such a sample.
     for estimate in
         [force_mae.biased, all.gamma.spearman, all.gamma_nbr.roc_auc[at_one], oxygen.gamma.spearman]
