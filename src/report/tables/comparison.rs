@@ -224,7 +224,7 @@ fn areas(comparison: &WalkComparison) -> PageTable {
     table
 }
 
-/// By element and group; without rows if there is only one element.
+/// By element, of matched structures and of all; without rows if there is only one element.
 fn elements(comparison: &WalkComparison) -> PageTable {
     let caption = format!(
         "The atoms of each element: median force error, and how well the grades rank it (ROC-AUC for errors above {LARGE_FORCE_ERROR} eV \
@@ -242,7 +242,8 @@ fn elements(comparison: &WalkComparison) -> PageTable {
         INTERVAL,
     ];
     let mut table = PageTable::new("elements", &caption, &titles);
-    let groups = named(comparison);
+    let mut groups = named(comparison);
+    groups.retain(|(name, _)| name.starts_with("matched") || *name == "pooled all");
     if groups.iter().all(|(_, group)| group.elements.len() < 2) {
         return table;
     }

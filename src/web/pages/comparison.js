@@ -14,12 +14,13 @@ export function comparison({ biased_against_control: compared, large }) {
   const { matched, pooled, pairs, thresholds } = compared;
   const groups = [["matched biased", matched.biased], ["matched control", matched.control], ["pooled all", pooled.all],
     ["pooled biased", pooled.biased], ["pooled control", pooled.control]].filter(([, group]) => group.structures > 0);
+  const both = groups.filter(([name]) => name.startsWith("matched") || name === "pooled all");
   return section("Biased against control",
     element("p", {}, "Matched: a labelled candidate of a biased walk and the labelled frame of its control walk at the same step. Pooled: all "
       + "labelled structures, with a partner or without."),
     element("ul", {}, compared.notes.map((note) => element("li", {}, `${note}.`))),
     pairs.counts.pairs > 0 && pairTable(pairs), ranges(pairs), groupTable(groups),
-    rankTable(groups, thresholds.indexOf(large), large), areas(groups, thresholds), elementTable(groups, large));
+    rankTable(groups, thresholds.indexOf(large), large), areas(both, thresholds), elementTable(both, large));
 }
 
 /** A number, and its interval below it. */
@@ -37,7 +38,7 @@ function pairTable(pairs) {
   const columns = [["median over the pairs"], ["pairs", true], ["biased", true], ["control", true], ["difference of medians", true],
     ["biased larger in", true], ["Wilcoxon p", true], ["sign test p", true]];
   const quantities = [["force MAE (eV/Å)", pairs.force_mae, 3, 1], ["mean |ΔF| (eV/Å)", pairs.mean_force_error, 3, 1],
-    ["energy error (meV/atom)", pairs.energy, 1, 1000], ["stress error (GPa)", pairs.stress, 3, GPA]];
+    ["energy error (meV/atom)", pairs.energy, 1, 1000], ["stress error (GPa)", pairs.stress, 2, GPA]];
   const rows = quantities.filter(([, of]) => of.pairs > 0).map(([name, of, digits, factor]) => [sentence(name), whole(of.pairs),
     estimate(of.biased, digits, factor), estimate(of.control, digits, factor), estimate(of.difference_of_medians, digits, factor),
     `${of.tests.biased_larger} of ${of.tests.biased_larger + of.tests.control_larger}`, probability(of.tests.wilcoxon_p),
@@ -55,19 +56,18 @@ function ranges({ force_mae: { biased_between: biased, control_between: control 
 
 function groupTable(groups) {
   const columns = [["structures"], ["number", true], ["failed", true], ["seed structures", true], ["walks", true], ["mean T (K)", true],
-    ["mean V/V₀", true], ["median MAE (eV/Å)", true], ["median |ΔF| (eV/Å)", true]];
+    ["mean V/V₀", true], ["median MAE (eV/Å)", true]];
   const rows = groups.map(([name, group]) => [name, whole(group.structures), whole(group.failed), whole(group.units.seed_structures),
-    whole(group.units.walks), decimals(group.mean_temperature, 0), decimals(group.mean_relative_volume, 3), estimate(group.median_force_mae, 3),
-    estimate(group.median_error, 3)]);
+    whole(group.units.walks), decimals(group.mean_temperature, 0), decimals(group.mean_relative_volume, 3), estimate(group.median_force_mae, 3)]);
   return table("Groups of structures", columns, rows);
 }
 
 function rankTable(groups, place, large) {
-  const columns = [["structures"], ["ρ(γ)", true], ["ρ(γ_nbr)", true], [`ROC-AUC(γ), error > ${tick(large)} eV/Å`, true],
-    ["ROC-AUC(γ_nbr)", true]];
-  const rows = groups.map(([name, { gamma, gamma_nbr: near }]) => [name, estimate(gamma.spearman, 3), estimate(near.spearman, 3),
-    estimate(gamma.roc_auc[place] ?? {}, 3), estimate(near.roc_auc[place] ?? {}, 3)]);
-  return table("Ranks of the errors by groups", columns, rows);
+  const columns = [["structures"], ["median |ΔF| (eV/Å)", true], ["ρ(γ)", true], ["ρ(γ_nbr)", true],
+    [`ROC-AUC(γ), error > ${tick(large)} eV/Å`, true], ["ROC-AUC(γ_nbr)", true]];
+  const rows = groups.map(([name, { median_error: median, gamma, gamma_nbr: near }]) => [name, estimate(median, 3), estimate(gamma.spearman, 3),
+    estimate(near.spearman, 3), estimate(gamma.roc_auc[place] ?? {}, 3), estimate(near.roc_auc[place] ?? {}, 3)]);
+  return table("Errors of atoms and their ranks, by groups", columns, rows);
 }
 
 /** The ROC-AUC of γ_nbr over the thresholds of the error. */
