@@ -36,6 +36,44 @@ fn content(row: &ExportRow) -> String {
     block.view().id().content.to_string()
 }
 
+/// Mean absolute errors of the force components of pairs (biased, control), and the number of pairs that are one structure.
+fn force_maes(directory: &Path) -> (Vec<[f64; 2]>, usize) {
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let matched = runtime.block_on(async {
+        let store = Store::open_read_only(directory).await.unwrap();
+        store.matched_walks().await.unwrap()
+    });
+    let mae = |row: &ExportRow| {
+        let ExportSource::Candidate { block, .. } = &row.source else { panic!("an import") };
+        let components = block.view().forces.iter().flatten().zip(row.label.forces.iter().flatten());
+        let errors: Vec<_> = components.map(|(model, label)| (model - label).abs()).collect();
+        errors.iter().sum::<f64>() / errors.len() as f64
+    };
+    let rows = labelled(directory);
+    let place = |row: &ExportRow| {
+        let ExportSource::Candidate { block, .. } = &row.source else { panic!("an import") };
+        let id = block.view().id();
+        (id.walk.0, id.step)
+    };
+    let (mut pairs, mut same) = (Vec::new(), 0);
+    for control in &rows {
+        let (walk, step) = place(control);
+        let Some(partner) = matched.get(&walk) else { continue };
+        for biased in rows.iter().filter(|row| place(row) == (*partner, step)) {
+            match content(biased) == content(control) {
+                true => same += 1,
+                false => pairs.push([mae(biased), mae(control)]),
+            }
+        }
+    }
+    (pairs, same)
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    0.5 * (values[(values.len() - 1) / 2] + values[values.len() / 2])
+}
+
 /// (γ, force error) of every atom.
 fn pairs(rows: &[&ExportRow]) -> Vec<(f64, f64)> {
     let mut pairs = Vec::new();
@@ -90,6 +128,13 @@ fn structures_of_both_walks_are_counted_and_not_compared() {
     let errors = json(here, ["force-errors", "campaign"]);
     let structures = ["all", "biased", "control"].map(|of| errors[of]["structures"].as_u64().unwrap());
     assert_eq!((structures, &errors["shared_structures"]), ([6, 2, 2], &2.into()));
+    let compared = &errors["biased_against_control"];
+    let (pairs, same) = force_maes(&here.join("campaign"));
+    let counts = &compared["pairs"]["counts"];
+    assert_eq!((counts["pairs"].as_u64(), counts["same_structure"].as_u64()), (Some(2), Some(2)));
+    assert_eq!((pairs.len(), same), (2, 2));
+    let pooled = ["all", "biased", "control"].map(|of| compared["pooled"][of]["structures"].as_u64());
+    assert_eq!(pooled, [6, 2, 2].map(Some));
     succeed(here, ["report", "campaign", "-o", "report"]);
     let page = fs::read_to_string(here.join("report/report.html")).unwrap();
     assert!(page.contains("2 structures found by both biased walks and their controls are excluded"));
@@ -158,6 +203,7 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     }
     assert!(!succeed(here, ["status", "whole"]).contains("unlabelled"));
     common::report::check(here, "strict", &status, &errors);
+    compared_by_pairs(here, &errors);
     // An unknown protocol.
     let wrong = common::refuse(here, ["force-errors", "whole", "--protocol", "nothing"]);
     assert!(wrong.contains("no protocol 'nothing'; it has 'potential'"), "{wrong}");
@@ -170,6 +216,33 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
         );
     }
     assert!(errors["version"].is_null() && errors["by_version"].is_null(), "{errors}");
+}
+
+/// The comparison of the campaigns `whole` and `strict`, in which a third of the labels failed: `errors`.
+fn compared_by_pairs(here: &Path, errors: &Json) {
+    let whole = json(here, ["force-errors", "whole"]);
+    let (whole, strict) = (&whole["biased_against_control"], &errors["biased_against_control"]);
+    let number = |of: &Json, key: &str| of["pairs"]["counts"][key].as_u64().unwrap();
+    let (pairs, same) = force_maes(&here.join("whole"));
+    assert!(pairs.len() > 1, "{pairs:?}");
+    assert_eq!((number(whole, "pairs"), number(whole, "same_structure")), (pairs.len() as u64, same as u64));
+    let found = &whole["pairs"]["force_mae"];
+    for (k, side) in ["biased", "control"].into_iter().enumerate() {
+        let expected = median(pairs.iter().map(|pair| pair[k]).collect());
+        let value = found[side]["value"].as_f64().unwrap();
+        assert!((value - expected).abs() < 1e-12, "{side} {value} {expected}");
+        assert!(found[side]["interval"].is_null(), "two seed structures have no intervals: {found}");
+    }
+    let larger = pairs.iter().filter(|[biased, control]| biased > control).count();
+    assert_eq!(found["tests"]["biased_larger"].as_u64(), Some(larger as u64));
+    // Every pair of the whole campaign is one of the other, with labels or without.
+    let outcomes = ["pairs", "same_structure", "biased_failed", "control_failed", "both_failed"];
+    let all = |of: &Json| outcomes.iter().map(|key| number(of, key)).sum::<u64>();
+    assert_eq!(all(strict), all(whole), "{strict}");
+    assert!(all(strict) > number(strict, "pairs") + number(strict, "same_structure"), "{strict}");
+    let text = succeed(here, ["force-errors", "whole"]);
+    let words = format!("{} pairs of 2 seed structures and", pairs.len());
+    assert!(text.contains(&words) && text.contains("are too few for a bootstrap"), "{text}");
 }
 
 #[test]

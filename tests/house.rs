@@ -233,6 +233,7 @@ fn views_never_write() {
         "src/cli/status",
         "src/cli/explain",
         "src/cli/force_errors.rs",
+        "src/cli/force_errors",
         "src/cli/watch/reader.rs",
         "src/report",
         "src/web",

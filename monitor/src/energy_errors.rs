@@ -116,9 +116,14 @@ impl EnergyErrors {
         Self { reference, errors: SystematicSample::new(MAX_SAMPLES), sum: 0.0, largest: 0.0, left_out: 0 }
     }
 
+    /// See [`ProtocolEnergyOffsets::error_per_atom`].
+    pub fn error_per_atom(&self, structure: &Structure, model: f64, label: f64) -> Option<f64> {
+        self.reference.error_per_atom(structure, model, label)
+    }
+
     /// Adds a labelled structure with its energies, eV.
     pub fn add(&mut self, structure: &Structure, model: f64, label: f64) {
-        match self.reference.error_per_atom(structure, model, label) {
+        match self.error_per_atom(structure, model, label) {
             Some(error) => {
                 self.errors.add(error.abs());
                 self.sum += error.abs();

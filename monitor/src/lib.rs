@@ -1,10 +1,10 @@
 //! The read side: what all views show of a campaign, read from its store and computed from it.
 //!
 //! [`Snapshot`] is the state of a campaign; [`candidate_details`] the history of one candidate; [`label_statistics`]
-//! the potential's errors against labels; [`label_cost`] what labels cost; [`mixture_status`] how far the mixture has
-//! moved; [`versions`] the versions of its potential, and [`improvement`] what one gained; [`end_reason`] why the
-//! campaign ended. Nothing here writes to the store, and nothing renders: values leave as numbers, or as the JSON that
-//! the documents describe.
+//! the potential's errors against labels, and biased walks against their controls; [`label_cost`] what labels cost;
+//! [`mixture_status`] how far the mixture has moved; [`versions`] the versions of its potential, and [`improvement`] what
+//! one gained; [`end_reason`] why the campaign ended. Nothing here writes to the store, and nothing renders: values leave
+//! as numbers, or as the JSON that the documents describe.
 
 pub mod candidate_details;
 pub mod disk;

@@ -1,5 +1,7 @@
 //! `calmwalk force-errors`
 
+mod comparison;
+
 use std::io::{self, Write};
 
 use analysis::{CompletionBin, ErrorBin};
@@ -19,7 +21,8 @@ const NAMES: usize = 3;
 /// median and percentiles in bins of the grade, Spearman's ρ, and the area under the receiver operating characteristic
 /// (ROC-AUC) of the grade as a test for errors above 1 eV/Å. The errors of structures whose labels failed are unknown: these
 /// structures are counted separately ('without label') in their bins. Energy errors exclude a fitted offset per element, because
-/// labels and potential have different zeros of energy. In a campaign with several versions of the potential, all this is of the
+/// labels and potential have different zeros of energy. Biased walks are compared with their controls, matched by pairs and pooled,
+/// with tests and with confidence intervals by bootstrap over seed structures; docs/errors.md defines each number. In a campaign with several versions of the potential, all this is of the
 /// structures from walks with one version, and a table compares the versions, each by its own grades. Works while the campaign
 /// runs.
 #[derive(Debug, clap::Args)]
@@ -115,6 +118,7 @@ fn write(out: &mut dyn Write, protocol: &Protocol, statistics: &LabelStatistics)
         writeln!(out, "excluded: {gamma} atoms without a finite γ, {gamma_nbr} without a finite γ_nbr")?;
     }
     write_energies(out, statistics)?;
+    comparison::write(out, &statistics.comparison())?;
     write_versions(out, statistics)?;
     for (name, errors) in [("γ", &all.gamma), ("γ_nbr", &all.gamma_nbr)] {
         write_bins(out, name, &errors.bins())?;

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use monitor::label_statistics::comparison::WalkComparison;
 use monitor::label_statistics::{self, LabelStatistics};
 use monitor::versions::{CampaignVersions, newest_with_labels};
 use serde_json::Value;
@@ -49,6 +50,8 @@ pub struct ProtocolLabels {
     pub protocol: Protocol,
     /// Statistics of force errors and completion.
     pub statistics: LabelStatistics,
+    /// Biased walks beside their controls.
+    pub comparison: WalkComparison,
     /// Cost of each label, newest first.
     pub costs: Vec<LabelCost>,
     /// Failures of attempts.
@@ -101,8 +104,10 @@ impl ReportData {
 impl ProtocolLabels {
     async fn read(store: &Store, protocol: Protocol, version: u32) -> Result<Self, StoreError> {
         let hash = protocol.hash;
+        let statistics = label_statistics::read(store, hash, Some(version)).await?;
         Ok(Self {
-            statistics: label_statistics::read(store, hash, Some(version)).await?,
+            comparison: statistics.comparison(),
+            statistics,
             costs: store.label_costs(hash, MAX_COSTS).await?,
             failures: store.failures(hash).await?,
             unlabelled: store.unlabelled(hash, true).await?,

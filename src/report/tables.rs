@@ -1,5 +1,6 @@
 //! The tables of a report, rounded for the page and with full precision for a file.
 
+mod comparison;
 mod conditions;
 mod facts;
 mod forgetting;
@@ -39,9 +40,11 @@ pub fn all(data: &ReportData) -> Vec<PageTable> {
         forgetting::components(data),
         conditions::conditions(data),
         seed_structures::seed_structures(data),
-        versions::versions(&data.versions),
-        versions::errors(&data.versions),
     ];
+    if let Some(found) = &data.labels {
+        tables.extend(comparison::all(&found.comparison));
+    }
+    tables.extend([versions::versions(&data.versions), versions::errors(&data.versions)]);
     if let Some(found) = &data.labels {
         tables.extend([
             labels::correlations(&found.statistics),

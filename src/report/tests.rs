@@ -227,6 +227,49 @@ async fn figures_have_the_numbers_of_the_store() {
     assert!(files.iter().zip(&again).all(|(a, b)| a.path == b.path && a.bytes == b.bytes), "the same bytes");
 }
 
+#[tokio::test]
+async fn biased_walks_are_compared_with_their_controls() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = begin(directory.path(), "{}").await;
+    let control = WalkRecord { partner: Some(WalkId(0)), ..walk(1, 0, Origin::Control) };
+    let walks = vec![walk(0, 0, Origin::Biased), control];
+    store.commit(&Commit { walks, ..Commit::default() }).await.unwrap();
+    for step in 0..30 {
+        offer(&store, step, Origin::Biased, Fate::Accepted, false).await;
+        if step < 20 {
+            offer(&store, step, Origin::Control, Fate::Accepted, false).await;
+        }
+    }
+    label_all(&store).await;
+    let files = build(&store, None).await.unwrap();
+    let page = words(file(&files, PAGE));
+    for expected in ["no intervals: 1 seed structure and 1 biased walk are too few", "n = 20 pairs"] {
+        assert!(page.replace('\u{a0}', " ").contains(expected), "{expected}: {page}");
+    }
+    // The errors are 0.1 to 0.8 along x: their mean is 0.45, that of the components a third.
+    let pairs = file(&files, "tables/pairs.csv");
+    let row: Vec<_> = pairs.lines().nth(1).unwrap().split(',').collect();
+    assert_eq!((row[0], row[1], row[2], row[4]), ("force MAE (eV/Å)", "biased", "20", ""), "{pairs}");
+    assert!((row[3].parse::<f64>().unwrap() - 0.15).abs() < 1e-12, "{pairs}");
+    // Both sides have the same errors: nothing to test.
+    assert!(file(&files, "tables/pair-tests.csv").contains("force MAE (eV/Å),0 of 0,,,0 of 0,,"));
+    assert!(
+        file(&files, "tables/pair-counts.csv")
+            .contains("biased structures without a labelled or failed partner,10\n")
+    );
+    let groups = file(&files, "tables/comparison.csv");
+    assert!(
+        groups.contains("matched control,20,0,1,1,300,") && groups.contains("pooled biased,30,0,1,1,300,")
+    );
+    let points = file(&files, "figures/pairs.csv");
+    assert_eq!(points.lines().filter(|line| line.starts_with("a,")).count(), 20);
+    assert!(
+        points.contains("a,0,0,19,,") && points.contains("\na median,") && points.contains("\nb,,,,0.1,")
+    );
+    words(file(&files, "figures/pairs.svg"));
+    assert!(!files.iter().any(|file| file.path == "tables/elements.csv"), "there is one element");
+}
+
 /// A walk with this number and version of the potential.
 fn walk(number: u32, version: u32, origin: Origin) -> WalkRecord {
     WalkRecord {

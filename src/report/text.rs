@@ -27,6 +27,14 @@ fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [PageTa
         (
             "Biased against control walks",
             blocks(vec![
+                table("pairs"),
+                numbered("pairs"),
+                table("pair-tests"),
+                table("pair-counts"),
+                table("comparison"),
+                table("comparison-ranks"),
+                table("auc-by-threshold"),
+                table("elements"),
                 numbered("distributions"),
                 numbered("errors"),
                 numbered("space"),

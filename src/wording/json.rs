@@ -3,10 +3,10 @@
 use monitor::Snapshot;
 use monitor::candidate_details::CandidateDetails;
 use monitor::label_statistics::LabelStatistics;
-use serde_json::Value;
+use serde_json::{Value, json};
 use store::Protocol;
 
-use super::{end_reason, energies, reference_check};
+use super::{comparison, end_reason, energies, reference_check};
 
 /// The JSON of `calmwalk status` (docs/status.md), without the jobs of a batch system.
 pub fn snapshot(snapshot: &Snapshot) -> serde_json::Result<Value> {
@@ -20,10 +20,14 @@ pub fn snapshot(snapshot: &Snapshot) -> serde_json::Result<Value> {
     Ok(json)
 }
 
-/// The JSON of `calmwalk force-errors`, for labels of this protocol.
+/// The JSON of `calmwalk force-errors`, for labels of this protocol. The intervals of its comparison may take seconds in a large
+/// campaign.
 pub fn force_errors(statistics: &LabelStatistics, protocol: &Protocol) -> Value {
     let mut json = statistics.to_json(protocol);
     json["energy"]["offsets"]["note"] = energies::offsets(&statistics.energies.summary().offsets).into();
+    let compared = statistics.comparison();
+    json["biased_against_control"] = json!(compared);
+    json["biased_against_control"]["notes"] = comparison::notes(&compared).into();
     json
 }
 

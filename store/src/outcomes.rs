@@ -2,7 +2,7 @@
 
 use atoms::Species;
 use serde::Serialize;
-use wire::Origin;
+use wire::{ContentHash, Origin};
 
 use crate::records::AtomGrades;
 
@@ -112,6 +112,10 @@ pub struct FinishedCandidate {
     pub candidate: String,
     /// Number of its walk.
     pub walk: u32,
+    /// Step of its walk.
+    pub step: u64,
+    /// Hash of its structure.
+    pub content: ContentHash,
     /// Whether it has a label; otherwise all attempts failed.
     pub labelled: bool,
     /// Biased or control.

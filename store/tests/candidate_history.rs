@@ -1,6 +1,6 @@
 //! The history of a candidate, found by number, name or prefix.
 
-use store::{CandidateRef, Commit, CoveredCandidate, Fate, JobState, LabelStatus, StoreError};
+use store::{CandidateRef, Commit, CoveredCandidate, Fate, JobState, LabelStatus, StoreError, WalkRecord};
 use wire::messages::DeclineReason;
 use wire::{Origin, WalkId};
 
@@ -71,6 +71,9 @@ async fn a_candidate_is_found_with_related_records() {
     let (status, partner) = store.walk(WalkId(1)).await.unwrap().unwrap();
     assert_eq!((status.walk, status.state.as_str(), partner), (1, "running", None));
     assert!(store.walk(WalkId(7)).await.unwrap().is_none());
+    let control = WalkRecord { origin: Origin::Control, partner: Some(WalkId(1)), ..walk(2, 1) };
+    store.commit(&Commit { walks: vec![control], ..Commit::default() }).await.unwrap();
+    assert!(store.matched_walks().await.unwrap().into_iter().eq([(2, 1)]));
     assert_eq!(store.seed_structure(0).await.unwrap().unwrap().name, "diamond");
     assert!(store.seed_structure(1).await.unwrap().is_none());
     assert!(store.imported_structure(1).await.unwrap().is_none());

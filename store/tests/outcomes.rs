@@ -167,6 +167,12 @@ async fn failed_labels_are_grouped_by_seed_structure_and_formula() {
     }
     assert_eq!((jobs[0].class.as_deref(), jobs[3].class.as_deref()), (None, Some("crashed")));
     assert!(jobs[1].unlabelled.is_none());
+    for job in &jobs {
+        // campaign-walk.segment.step-content
+        let place = format!("-{}.0.{}-", job.walk, job.step);
+        assert!(job.candidate.contains(&place), "{} {place}", job.candidate);
+        assert!(job.content.to_string().starts_with(job.candidate.rsplit('-').next().unwrap()));
+    }
     assert_eq!(jobs[3].unlabelled.as_ref().unwrap().gamma, [4.0, 0.8]);
     // A protocol without jobs has no results.
     store.add_protocol(&protocol("other"), 0).await.unwrap();

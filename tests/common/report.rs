@@ -38,6 +38,23 @@ pub fn check(here: &Path, campaign: &str, status: &Value, errors: &Value) {
     assert!(!page.contains("https://") && !page.contains("<script") && !page.contains("<link"));
 
     // Compare with `errors`.
+    let compared = &errors["biased_against_control"];
+    if compared["pairs"]["counts"]["pairs"].as_u64() > Some(0) {
+        let medians = text("tables/pairs.csv");
+        let row = medians.lines().nth(1).expect("a row").split(',').collect::<Vec<_>>();
+        assert_eq!(
+            row[3].parse().ok(),
+            compared["pairs"]["force_mae"]["biased"]["value"].as_f64(),
+            "{medians}"
+        );
+        assert!(page.contains("<figure id=\"figure-pairs\">"));
+    }
+    let groups = text("tables/comparison.csv");
+    let pooled = groups.lines().find(|line| line.starts_with("pooled all,")).expect("a row");
+    assert_eq!(
+        pooled.split(',').nth(1).and_then(|n| n.parse().ok()),
+        compared["pooled"]["all"]["structures"].as_u64()
+    );
     let quantiles = text("tables/quantiles-gamma.csv");
     let bins = errors["all"]["gamma"]["bins"].as_array().expect("bins");
     assert_eq!(quantiles.lines().count(), bins.len() + 1);

@@ -170,11 +170,17 @@ fn fits(browser: &Browser, url: &str, is_there: &str) {
 }
 
 fn errors(browser: &Browser) {
-    browser.wait("document.querySelectorAll('figure svg[role=img]').length === 2");
+    browser.wait("document.querySelectorAll('figure svg[role=img]').length === 3");
     let text = browser.run("return document.querySelector('main').textContent");
     let text = text.as_str().unwrap();
-    for words in ["ρ(γ)", "ROC-AUC(γ_nbr)", "Force errors by γ_nbr", "median (eV/Å)", "Labels by V/V₀"]
-    {
+    for words in [
+        "ρ(γ)",
+        "ROC-AUC(γ_nbr)",
+        "Force errors by γ_nbr",
+        "Biased against control",
+        "median (eV/Å)",
+        "Labels by V/V₀",
+    ] {
         assert!(text.contains(words), "{words}: {text}");
     }
     assert!(!text.contains("NaN") && !text.contains("undefined"), "{text}");

@@ -1,6 +1,8 @@
 //! Statistics of the labels of a campaign: the potential's errors, whether the grade predicted them, and which
 //! structures have no label.
 
+pub mod comparison;
+mod frames;
 mod json;
 
 use std::collections::{BTreeMap, HashSet};
@@ -14,6 +16,8 @@ use store::{
 };
 use wire::{ContentHash, Origin};
 
+use self::comparison::{COMPARISON_BOOTSTRAP, WalkComparison};
+use self::frames::ComparedFrames;
 use crate::energy_errors::{EnergyErrors, ProtocolEnergyOffsets};
 use crate::versions::newest_with_labels;
 
@@ -62,6 +66,8 @@ pub struct LabelStatistics {
     pub by_gamma: Completion<String>,
     /// The same by V/V₀.
     pub by_expansion: Completion<String>,
+    /// Structures, a sample of atoms, and failures, for [`Self::comparison`].
+    compared: ComparedFrames,
 }
 
 /// Reads the labels of one protocol page by page. Without `version`, the statistics are those of the newest version with labels.
@@ -85,6 +91,7 @@ pub async fn read(
         shared: 0,
         by_gamma: Completion::new(Bins::for_grades()),
         by_expansion: Completion::new(Bins::for_volume_ratio()),
+        compared: ComparedFrames::new(store.matched_walks().await?),
     };
     let shared = store.structures_of_both_origins().await?;
     let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
@@ -107,7 +114,12 @@ pub async fn read(
 }
 
 impl LabelStatistics {
-    /// The JSON of `calmwalk force-errors`, for labels of this protocol, without sentences.
+    /// Biased walks compared with their controls. The confidence intervals may take seconds in a large campaign.
+    pub fn comparison(&self) -> WalkComparison {
+        WalkComparison::new(&self.compared, COMPARISON_BOOTSTRAP)
+    }
+
+    /// The JSON of `calmwalk force-errors`, for labels of this protocol, without sentences and without [`Self::comparison`].
     pub fn to_json(&self, protocol: &Protocol) -> Value {
         json::to_json(protocol, self)
     }
@@ -129,6 +141,10 @@ impl LabelStatistics {
         let errors = view.forces.iter().zip(&row.label.forces);
         let errors: Vec<_> = errors.map(|(model, label)| norm(sub(*model, *label))).collect();
         let (of, is_shared) = (versions.of(view.id().walk.0), shared.contains(&view.id().content));
+        if of == version {
+            let error = self.energies.error_per_atom(&row.structure, view.energy(), row.label.energy);
+            self.compared.add(row, is_shared, error);
+        }
         if is_shared && *origin == Origin::Control {
             // Counted with the biased walk.
             return;
@@ -163,6 +179,7 @@ impl LabelStatistics {
             }
         }
         if let Some(grades) = &candidate.unlabelled {
+            self.compared.add_failed(candidate);
             self.for_origin(candidate.origin, |all| all.unlabelled(grades));
         }
     }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use analysis::{Bins, Exceedance, ForceErrors, LabelledEnergy, SystematicSample};
+use analysis::{Bins, ERROR_THRESHOLDS, Exceedance, ForceErrors, LabelledEnergy, SystematicSample};
 use atoms::cell::{norm, sub};
 use atoms::extxyz::FrameLabels;
 use atoms::{Species, Vec3, composition};
@@ -11,10 +11,6 @@ use super::deviations::Deviations;
 
 /// Force errors above this count as large, eV/Å (paper, ROC-AUC).
 pub const LARGE_ERROR: f64 = 1.0;
-
-/// Thresholds of the force error, eV/Å, at which contamination is counted.
-pub const THRESHOLDS: [f64; 19] =
-    [0.01, 0.015, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0];
 
 /// Atoms in the sample for ranks, quantiles and intervals: about 150 bytes each for two scores.
 const SAMPLED_ATOMS: usize = 200_000;
@@ -116,7 +112,7 @@ impl LabelledErrors {
             stress: Deviations::default(),
             atoms: SystematicSample::new(atoms),
             sample: SystematicSample::new(structures),
-            exceedance: vec![Exceedance::new(&THRESHOLDS); columns.len()],
+            exceedance: vec![Exceedance::new(&ERROR_THRESHOLDS); columns.len()],
             bins: columns.iter().map(bins).collect(),
             left_out: 0,
             columns,

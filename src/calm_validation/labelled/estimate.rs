@@ -5,16 +5,15 @@ mod bins;
 mod compositions;
 mod structures;
 
-use analysis::Bootstrap;
+use analysis::{Bootstrap, ERROR_THRESHOLDS};
 
 use self::atoms::AtomStatistics;
 use self::structures::StructureStatistics;
-use super::collect::{LabelledErrors, SampledAtom, SampledStructure, THRESHOLDS};
+use super::collect::{LabelledErrors, SampledAtom, SampledStructure};
 use super::report::{
     BootstrapSettings, Confident, ElementAuc, IntervalEstimate, LabelledReport, ScoreReport,
 };
 use super::report::{ErrorHistograms, MeanErrors};
-use crate::all_cores;
 
 /// Intervals that hold the true value with a probability of 95 %.
 pub const BOOTSTRAP: Bootstrap = Bootstrap { draws: 1000, level: 0.95, seed: 1 };
@@ -53,11 +52,11 @@ impl LabelledErrors {
             offsets: structures.offsets(),
             forces,
             stress,
-            thresholds: THRESHOLDS.to_vec(),
+            thresholds: ERROR_THRESHOLDS.to_vec(),
             unfiltered: self
                 .exceedance
                 .first()
-                .map_or(vec![None; THRESHOLDS.len()], |found| found.unfiltered()),
+                .map_or(vec![None; ERROR_THRESHOLDS.len()], |found| found.unfiltered()),
             scores: self.scores((&sampled, &of_structures), &atoms, bootstrap),
             elements: compositions::by_element(&sampled, &self.columns),
             compositions: compositions::by_composition(&sampled, &of_structures, &self.columns),
@@ -67,7 +66,7 @@ impl LabelledErrors {
     /// Of energy with and without offsets, forces and stress. Those of energies without offsets are of the sample only.
     fn mean_errors(&self, structures: &StructureStatistics, bootstrap: Bootstrap) -> [MeanErrors; 4] {
         let draw = |draw| structures.values(&bootstrap.multiplicities(draw, structures.len()));
-        let intervals = intervals(bootstrap, draw);
+        let intervals = bootstrap.intervals(draw);
         let whole = structures.sums(&vec![1; structures.len()]);
         let exact = [self.energy, whole[1], self.forces, self.stress];
         std::array::from_fn(|k| {
@@ -87,7 +86,7 @@ impl LabelledErrors {
         bootstrap: Bootstrap,
     ) -> Vec<ScoreReport> {
         let intervals =
-            intervals(bootstrap, |draw| atoms.values(&bootstrap.multiplicities(draw, atoms.structures)));
+            bootstrap.intervals(|draw| atoms.values(&bootstrap.multiplicities(draw, atoms.structures)));
         let values = atoms.values(&vec![1; atoms.structures]);
         let estimates =
             values.into_iter().zip(intervals).map(|(value, interval)| IntervalEstimate { value, interval });
@@ -102,7 +101,7 @@ impl LabelledErrors {
                 let mut take =
                     |number: usize| -> Vec<IntervalEstimate> { next.by_ref().take(number).collect() };
                 let [spearman, worst_decile, retention] = std::array::from_fn(|_| take(1)[0]);
-                let (auc, contamination) = (take(THRESHOLDS.len()), take(THRESHOLDS.len()));
+                let (auc, contamination) = (take(ERROR_THRESHOLDS.len()), take(ERROR_THRESHOLDS.len()));
                 let worst_decile_by_element = atoms.elements().zip(take(usize::MAX));
                 let element =
                     |((element, atoms, threshold), auc)| ElementAuc { element, atoms, threshold, auc };
@@ -144,12 +143,4 @@ impl LabelledErrors {
             contamination: exact.map(|(value, estimate)| IntervalEstimate { value, ..estimate }).collect(),
         }
     }
-}
-
-/// The interval of each statistic, from its values in every draw.
-fn intervals(bootstrap: Bootstrap, draw: impl Fn(u32) -> Values + Sync) -> Vec<Option<(f64, f64)>> {
-    let draws = all_cores::map(0..bootstrap.draws, || (), |(), number| draw(number));
-    let number = draws.first().map_or(0, Vec::len);
-    let interval = |k| bootstrap.interval(&draws.iter().map(|values| values[k]).collect::<Vec<_>>());
-    (0..number).map(interval).collect()
 }

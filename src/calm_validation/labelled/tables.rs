@@ -2,6 +2,8 @@
 
 use std::io::{self, Write};
 
+use analysis::SHOWN_ERROR_THRESHOLDS;
+
 use super::collect::LARGE_ERROR;
 use super::composition_tables::{compositions, elements};
 use super::report::{Bin, IntervalEstimate, LabelledReport, MeanErrors, ScoreReport};
@@ -10,9 +12,6 @@ use crate::page::{PageTable, TableCell, count, percent, real, text};
 
 /// The force error of the paper's table of contamination, eV/Å.
 pub(super) const CONTAMINATION: f64 = 0.5;
-
-/// Thresholds of the table of areas under the ROC curve, eV/Å; its titles have them too.
-const AUC_THRESHOLDS: [f64; 4] = [0.1, 0.3, 1.0, 3.0];
 
 /// All tables that have rows.
 pub fn all(report: &LabelledReport) -> Vec<PageTable> {
@@ -119,7 +118,8 @@ fn confident(report: &LabelledReport) -> PageTable {
 }
 
 fn auc_thresholds(report: &LabelledReport) -> PageTable {
-    let places = AUC_THRESHOLDS.map(|error| report.threshold(error));
+    // The titles have them too.
+    let places = SHOWN_ERROR_THRESHOLDS.map(|error| report.threshold(error));
     let row = |score: &ScoreReport| {
         let of = |place: Option<usize>| place.map(|k| score.auc[k]).unwrap_or_default();
         let areas = places.into_iter().flat_map(|place| cells(of(place), 1.0, 3));

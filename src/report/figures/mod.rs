@@ -6,6 +6,7 @@ mod cost;
 mod distributions;
 mod errors;
 mod grades;
+mod pairs;
 mod projection;
 mod space;
 mod versions;
@@ -25,6 +26,7 @@ pub fn all(data: &ReportData) -> Vec<FigureEntry> {
     let part = |name, title, drawn| FigureEntry { name, title, drawn };
     let mut all = vec![
         part("collection", "Candidates and accepted structures", collection::draw(data)),
+        part("pairs", "Errors of biased walks and of their controls, pair by pair", pairs::draw(data)),
         part("distributions", "Grades and force errors", distributions::draw(&data.collections)),
         part("errors", "Force errors of new and of stretched structures", errors::draw(&data.collections)),
         part("space", "Volumes and composition", space::draw(&data.collections)),

@@ -19,5 +19,8 @@ async fn compute(store: Store) -> Result<String, ApiError> {
         || ApiError::new(StatusCode::NOT_FOUND, "the campaign has no label protocol, and so no labels");
     let protocol = store.protocol_in_force().await?.ok_or_else(none)?;
     let statistics = label_statistics::read(&store, protocol.hash, None).await?;
-    Ok(wording::json::force_errors(&statistics, &protocol).to_string())
+    // The intervals may take seconds.
+    let json = move || wording::json::force_errors(&statistics, &protocol).to_string();
+    let json = tokio::task::spawn_blocking(json).await;
+    json.map_err(|error| ApiError::new(StatusCode::INTERNAL_SERVER_ERROR, error.to_string()))
 }

@@ -22,6 +22,7 @@ const FILES: &[(&str, &str)] = files![
     "candidate.js",
     "candidates.js",
     "colours.js",
+    "comparison.js",
     "dom.js",
     "errors.js",
     "format.js",

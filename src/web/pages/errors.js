@@ -2,6 +2,7 @@
 
 import { fetchComputed, listen } from "./api.js";
 import { LINES } from "./colours.js";
+import { comparison } from "./comparison.js";
 import { element, section, table } from "./dom.js";
 import { decimals, percent, tick, whole } from "./format.js";
 import { plot } from "./plot.js";
@@ -40,6 +41,7 @@ function shown(errors) {
     section(`Protocol ${errors.protocol}${errors.version == null ? "" : `, version ${errors.version} of the potential`}`, correlations(errors),
       energies(errors.energy), byVersion(errors),
       element("div", { class: "plots" }, figure("γ", all.gamma), figure("γ_nbr", all.gamma_nbr))),
+    comparison(errors),
     section("By γ", quantiles("γ", all.gamma, errors.large)), section("By γ_nbr", quantiles("γ_nbr", all.gamma_nbr, errors.large)),
     section("Structures without a label", completion("γ_max", errors.completion_by_gamma), completion("V/V₀", errors.completion_by_relative_volume)),
   ];

@@ -1,13 +1,13 @@
 //! Pages of labelled structures.
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 
 use wire::ContentHash;
 
 use super::label_row::LabelRow;
 use super::restore::{block, grades, origin};
 use crate::Store;
-use crate::checksum::{CANDIDATE, DECISION, IMPORT, Names, ORIGINAL_GRADES, SEED_STRUCTURE, joined};
+use crate::checksum::{CANDIDATE, DECISION, IMPORT, Names, ORIGINAL_GRADES, SEED_STRUCTURE, WALK, joined};
 use crate::database::{FromRow, SqlRow, query};
 use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
@@ -56,7 +56,23 @@ pub(crate) const IMPORTS: &str = concat!(
 const OF_BOTH_ORIGINS: &str = "SELECT DISTINCT content FROM candidate WHERE origin = 'control'
     AND EXISTS (SELECT 1 FROM candidate other WHERE other.structure = candidate.structure AND other.origin = 'biased')";
 
+const CONTROL_WALKS: &str =
+    concat!("SELECT ", joined!(walk), " FROM walk WHERE origin = 'control' ORDER BY walk.walk");
+
 impl Store {
+    /// The control walks, each with the biased walk that it matches. A control frame matches the candidate that its biased walk found
+    /// at the same step.
+    pub async fn matched_walks(&self) -> Result<BTreeMap<u32, u32>> {
+        let mut matched = BTreeMap::new();
+        for row in query(CONTROL_WALKS).rows(&self.database).await? {
+            WALK.verify(&row, Names::Joined)?;
+            if let Some(partner) = row.get::<Option<u32>>("walk__partner")? {
+                matched.insert(row.get("walk__walk")?, partner);
+            }
+        }
+        Ok(matched)
+    }
+
     /// Structures found by both a biased walk and its control: the two share random numbers and agree until the
     /// bias acts. Such a structure has one label.
     pub async fn structures_of_both_origins(&self) -> Result<HashSet<ContentHash>> {

@@ -7,6 +7,7 @@ use super::{job_counts, protocols};
 use crate::Store;
 use crate::checksum::{CANDIDATE, Names, ORIGINAL_GRADES, joined};
 use crate::database::{FromRow, SqlRow, query};
+use crate::encoding::decode_hash;
 use crate::error::Result;
 use crate::outcomes::{FailureCount, FinishedCandidate, LabelCost, LabelUsage, Unlabelled, ValueRange};
 
@@ -238,6 +239,8 @@ impl FromRow for FinishedCandidate {
             decision: row.get("decision")?,
             candidate: row.get("candidate__id")?,
             walk: row.get("candidate__walk")?,
+            step: row.get("candidate__step")?,
+            content: decode_hash(&row.get::<Vec<u8>>("candidate__content")?)?,
             labelled,
             origin: origin(&row.get::<String>("candidate__origin")?)?,
             seed_structure: row.get("seed_name")?,

@@ -1,9 +1,11 @@
 //! Statistics of scores and force errors over the sampled atoms.
 
-use analysis::{Exceedance, Histogram, RankedErrors, binned_quantiles, decade_edges, quantile};
+use analysis::{
+    ERROR_THRESHOLDS, Exceedance, Histogram, RankedErrors, binned_quantiles, decade_edges, quantile,
+};
 use atoms::Species;
 
-use super::super::collect::{SampledAtom, ScoreColumn, THRESHOLDS};
+use super::super::collect::{SampledAtom, ScoreColumn};
 use super::super::report::{Band, ErrorHistograms, ErrorPopulation};
 use super::Values;
 
@@ -41,7 +43,7 @@ impl AtomStatistics {
             let threshold = quantile(&errors, 0.9).unwrap_or(f64::NAN);
             RankedElement { species, ranked: ranked(&atoms, columns.len()), threshold }
         };
-        let counts = Exceedance::new(&THRESHOLDS);
+        let counts = Exceedance::new(&ERROR_THRESHOLDS);
         let is_kept = |(k, column): (usize, &ScoreColumn)| -> Vec<bool> {
             sampled.iter().map(|atom| column.limit.is_none_or(|limit| atom.scores[k] <= limit)).collect()
         };
@@ -63,20 +65,20 @@ impl AtomStatistics {
 
     /// Number of [`Self::values`] of a column.
     pub fn values_of_column(&self) -> usize {
-        3 + 2 * THRESHOLDS.len() + self.elements.len()
+        3 + 2 * ERROR_THRESHOLDS.len() + self.elements.len()
     }
 
     /// For each column: ρ, mean area for the worst decile, retention, areas and contamination for each threshold, area for
     /// the worst decile of each element.
     pub fn values(&self, multiplicities: &[u32]) -> Values {
-        let whole = self.ranked.statistics(multiplicities, &THRESHOLDS);
+        let whole = self.ranked.statistics(multiplicities, &ERROR_THRESHOLDS);
         let of_element =
             |element: &RankedElement| element.ranked.statistics(multiplicities, &[element.threshold]);
         let by_element: Vec<_> = self.elements.iter().map(of_element).collect();
         let mut values = Vec::with_capacity(self.kept.len() * self.values_of_column());
         for (k, (statistics, kept)) in whole.iter().zip(&self.kept).enumerate() {
             let areas: Vec<_> = by_element.iter().map(|statistics| statistics[k].auc[0]).collect();
-            let mut counts = Exceedance::new(&THRESHOLDS);
+            let mut counts = Exceedance::new(&ERROR_THRESHOLDS);
             for ((unit, bin), is_kept) in self.atoms.iter().zip(kept) {
                 counts.add_to_bin(*bin, *is_kept, multiplicities[*unit as usize]);
             }

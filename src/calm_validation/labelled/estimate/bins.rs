@@ -4,8 +4,8 @@ use analysis::{BinStatistics, BinnedErrors, Bins, Bootstrap, ForceErrors};
 
 use super::super::collect::{LARGE_ERROR, SampledAtom};
 use super::super::report::Bin;
+use super::Values;
 use super::atoms::units;
-use super::{Values, intervals};
 
 /// The bins of a column. The intervals are from the sampled atoms.
 pub fn with_intervals(
@@ -23,7 +23,7 @@ pub fn with_intervals(
         let found = binned.statistics(&bootstrap.multiplicities(draw, structures));
         found.into_iter().flat_map(values).collect()
     };
-    let intervals = intervals(bootstrap, draw);
+    let intervals = bootstrap.intervals(draw);
     let of_bins = intervals.chunks(3).map(|of| [of[0], of[1], of[2]]);
     errors.bins().iter().zip(of_bins).map(|(bin, intervals)| Bin::new(bin, intervals)).collect()
 }

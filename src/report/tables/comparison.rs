@@ -1,0 +1,277 @@
+//! Biased walks compared with their controls.
+
+use analysis::{ERROR_THRESHOLDS, threshold_place};
+use atoms::units::GPA_PER_EV_A3;
+use monitor::label_statistics::LARGE_FORCE_ERROR;
+use monitor::label_statistics::comparison::{
+    ComparedGroup, ConfidenceEstimate, PairedErrors, PairedQuantity, WalkComparison,
+};
+
+use super::{PageTable, TableCell, count, real, text};
+use crate::wording::comparison::{intervals, larger, probability};
+
+/// Title of a column of intervals.
+const INTERVAL: &str = "95 %";
+
+/// All tables of the comparison. Those without rows are left out later.
+pub fn all(comparison: &WalkComparison) -> [PageTable; 7] {
+    [
+        pairs(comparison),
+        tests(&comparison.pairs),
+        unpaired(&comparison.pairs),
+        groups(comparison),
+        ranks(comparison),
+        areas(comparison),
+        elements(comparison),
+    ]
+}
+
+/// An error over the pairs, with its unit, the factor to this unit, and the number of decimals.
+type ShownError<'a> = (&'static str, &'a PairedQuantity, f64, usize);
+
+/// The errors that are known of any pairs.
+fn known(pairs: &PairedErrors) -> Vec<ShownError<'_>> {
+    let mut all = vec![
+        ("force MAE (eV/Å)", &pairs.force_mae, 1.0, 3),
+        ("mean |ΔF| (eV/Å)", &pairs.mean_force_error, 1.0, 3),
+        ("energy (meV/atom)", &pairs.energy, 1000.0, 1),
+        ("stress (GPa)", &pairs.stress, GPA_PER_EV_A3, 3),
+    ];
+    all.retain(|(_, quantity, ..)| quantity.pairs > 0);
+    all
+}
+
+/// Errors over the pairs.
+fn pairs(comparison: &WalkComparison) -> PageTable {
+    let caption = format!(
+        "Biased against control, matched: medians over pairs of a labelled candidate of a biased walk and the labelled frame of its control \
+         walk at the same step. Force MAE, mean absolute error of the force components of a structure; mean |ΔF|, mean of \
+         |F_{{model}} − F_{{label}}| over its atoms; energy, |E_{{model}} − E_{{label}}| per atom without the offsets of the elements; stress, \
+         root mean square error of six components; {}.",
+        intervals(&comparison.pairs.units, comparison)
+    );
+    let mut table = PageTable::new("pairs", &caption, &["error", "of", "pairs", "median", INTERVAL]);
+    for (name, quantity, factor, digits) in known(&comparison.pairs) {
+        let PairedQuantity { biased, control, difference_of_medians, median_difference, .. } = quantity;
+        for (of, estimate) in [
+            ("biased", biased),
+            ("control", control),
+            ("difference of medians", difference_of_medians),
+            ("difference within pairs", median_difference),
+        ] {
+            let mut row = vec![text(name), text(of), count(quantity.pairs)];
+            row.extend(cells(estimate, factor, digits));
+            table.rows.push(row);
+        }
+    }
+    table
+}
+
+/// Tests of the differences within the pairs.
+fn tests(pairs: &PairedErrors) -> PageTable {
+    let caption = "Tests of the differences within the pairs, biased − control: two-sided probabilities of Wilcoxon’s signed-rank test and of \
+                   the sign test as if pairs were independent, and over one difference for each resampled unit (the median of its pairs), \
+                   since pairs of one unit resemble each other.";
+    let titles = [
+        "error",
+        "biased larger in",
+        "Wilcoxon p",
+        "sign test p",
+        "over units: biased larger in",
+        "Wilcoxon p",
+        "sign test p",
+    ];
+    let mut table = PageTable::new("pair-tests", caption, &titles);
+    for (name, quantity, ..) in known(pairs) {
+        let mut row = vec![text(name)];
+        for tests in [&quantity.tests, &quantity.tests_by_unit] {
+            row.push(text(larger(tests)));
+            row.extend([tests.wilcoxon_p, tests.sign_p].map(probability_cell));
+        }
+        table.rows.push(row);
+    }
+    table
+}
+
+/// What is not among the pairs, and what the failures could change.
+fn unpaired(pairs: &PairedErrors) -> PageTable {
+    let caption = "What is among the pairs of biased candidates and control frames, and what is not. Errors of structures whose labels \
+                   failed are unknown: the last rows are the ranges of the medians for any errors of theirs.";
+    let mut table = PageTable::new("pair-counts", caption, &["", "value"]);
+    let counts = &pairs.counts;
+    let rows = [
+        ("pairs with both labels", counts.pairs),
+        ("seed structures of the pairs", pairs.units.seed_structures as u64),
+        ("biased walks of the pairs", pairs.units.walks as u64),
+        ("left out: one structure on both sides", counts.same_structure),
+        ("left out: the biased label failed", counts.biased_failed),
+        ("left out: the control label failed", counts.control_failed),
+        ("left out: both labels failed", counts.both_failed),
+        ("biased structures without a labelled or failed partner", counts.biased_alone),
+        ("control frames without a labelled or failed partner", counts.control_alone),
+    ];
+    if rows.iter().all(|(_, number)| *number == 0) {
+        return table;
+    }
+    table.rows.extend(rows.map(|(name, number)| vec![text(name), count(number)]));
+    let ranges = [
+        ("median force MAE of biased candidates between (eV/Å)", pairs.force_mae.biased_between),
+        ("median force MAE of control frames between (eV/Å)", pairs.force_mae.control_between),
+    ];
+    for (name, range) in ranges {
+        if let Some(range) = range {
+            table.rows.push(vec![text(name), text(crate::wording::comparison::median_range(range, 3))]);
+        }
+    }
+    table
+}
+
+/// The groups with structures: matched, then pooled.
+fn named(comparison: &WalkComparison) -> Vec<(&'static str, &ComparedGroup)> {
+    let (matched, pooled) = (&comparison.matched, &comparison.pooled);
+    let mut all = vec![
+        ("matched biased", &matched.biased),
+        ("matched control", &matched.control),
+        ("pooled all", &pooled.all),
+        ("pooled biased", &pooled.biased),
+        ("pooled control", &pooled.control),
+    ];
+    all.retain(|(_, group)| group.structures > 0);
+    all
+}
+
+fn groups(comparison: &WalkComparison) -> PageTable {
+    let caption = format!(
+        "Labelled structures of biased and control walks. Matched, those of the pairs; pooled, all, with a partner or without. Failed, \
+         structures of the same kind whose labels failed: their errors are unknown. T, mean kinetic temperature of the structures (a strong \
+         bias heats). Medians, of the MAE over structures and of |ΔF| = |F_{{model}} − F_{{label}}| over atoms. Pooled: {}.",
+        intervals(&comparison.pooled.all.units, comparison)
+    );
+    let titles = [
+        "",
+        "structures",
+        "failed",
+        "seed structures",
+        "walks",
+        "T (K)",
+        "V/V_{0}",
+        "MAE (eV Å^{−1})",
+        INTERVAL,
+        "|ΔF| (eV Å^{−1})",
+        INTERVAL,
+    ];
+    let mut table = PageTable::new("comparison", &caption, &titles);
+    for (name, group) in named(comparison) {
+        let mut row = vec![
+            text(name),
+            count(group.structures),
+            count(group.failed),
+            count(group.units.seed_structures as u64),
+            count(group.units.walks as u64),
+            real(group.mean_temperature, 0),
+            real(group.mean_relative_volume, 3),
+        ];
+        row.extend(cells(&group.median_force_mae, 1.0, 3));
+        row.extend(cells(&group.median_error, 1.0, 3));
+        table.rows.push(row);
+    }
+    table
+}
+
+/// How well both grades rank the errors of each group.
+fn ranks(comparison: &WalkComparison) -> PageTable {
+    let caption = format!(
+        "How well the grades under the original mixture rank the force errors of atoms, in the groups of the table before: Spearman’s ρ, and \
+         ROC-AUC for errors above {LARGE_FORCE_ERROR} eV Å^{{−1}}."
+    );
+    let titles = ["", "grade", "sampled atoms", "ρ", INTERVAL, "ROC-AUC", INTERVAL];
+    let mut table = PageTable::new("comparison-ranks", &caption, &titles);
+    let large = threshold_place(LARGE_FORCE_ERROR);
+    for (name, group) in named(comparison) {
+        for (grade, ranking) in [("γ", &group.gamma), ("γ_nbr", &group.gamma_nbr)] {
+            let area = large.and_then(|place| ranking.roc_auc.get(place)).copied().unwrap_or_default();
+            let mut row = vec![text(name), text(grade), count(group.sampled_atoms)];
+            row.extend(cells(&ranking.spearman, 1.0, 3));
+            row.extend(cells(&area, 1.0, 3));
+            table.rows.push(row);
+        }
+    }
+    table
+}
+
+/// The ROC-AUC of γ_nbr for every threshold of the force error with large and small errors.
+fn areas(comparison: &WalkComparison) -> PageTable {
+    let caption = "ROC-AUC of γ_{nbr} under the original mixture as a test for force errors above a threshold, for each threshold with \
+                   errors on both sides, in the groups of the table of medians.";
+    let titles = [
+        "threshold (eV Å^{−1})",
+        "matched biased",
+        INTERVAL,
+        "matched control",
+        INTERVAL,
+        "pooled all",
+        INTERVAL,
+    ];
+    let mut table = PageTable::new("auc-by-threshold", caption, &titles);
+    let groups = [&comparison.matched.biased, &comparison.matched.control, &comparison.pooled.all];
+    for (place, threshold) in ERROR_THRESHOLDS.iter().enumerate() {
+        let of = groups.map(|group| group.gamma_nbr.roc_auc.get(place).copied().unwrap_or_default());
+        if of.iter().any(|area| area.value.is_some()) {
+            let areas = of.iter().flat_map(|area| cells(area, 1.0, 3));
+            table.rows.push([text(threshold.to_string())].into_iter().chain(areas).collect());
+        }
+    }
+    table
+}
+
+/// By element, of matched structures and of all; without rows if there is only one element.
+fn elements(comparison: &WalkComparison) -> PageTable {
+    let caption = format!(
+        "The atoms of each element: median force error, and how well the grades rank it (ROC-AUC for errors above {LARGE_FORCE_ERROR} eV \
+         Å^{{−1}}). Intervals where enough of the resampled units have the element."
+    );
+    let titles = [
+        "element",
+        "of",
+        "sampled atoms",
+        "median |ΔF| (eV Å^{−1})",
+        INTERVAL,
+        "ρ(γ_{nbr})",
+        INTERVAL,
+        "ROC-AUC(γ_{nbr})",
+        INTERVAL,
+    ];
+    let mut table = PageTable::new("elements", &caption, &titles);
+    let mut groups = named(comparison);
+    groups.retain(|(name, _)| name.starts_with("matched") || *name == "pooled all");
+    if groups.iter().all(|(_, group)| group.elements.len() < 2) {
+        return table;
+    }
+    let rows = groups.iter().flat_map(|(name, group)| group.elements.iter().map(move |of| (*name, of)));
+    let mut rows: Vec<_> = rows.collect();
+    rows.sort_by_key(|(_, of)| of.element);
+    for (name, of) in rows {
+        let mut row = vec![text(of.element), text(name), count(of.sampled_atoms)];
+        let area = of.gamma_nbr.roc_auc.first().copied().unwrap_or_default();
+        for estimate in [of.median_error, of.gamma_nbr.spearman, area] {
+            row.extend(cells(&estimate, 1.0, 3));
+        }
+        table.rows.push(row);
+    }
+    table
+}
+
+/// Value and interval.
+fn cells(estimate: &ConfidenceEstimate, factor: f64, digits: usize) -> [TableCell; 2] {
+    let interval = estimate.interval.map(|(low, high)| [low, high].map(|x| real(factor * x, digits)));
+    let text = |of: fn(&TableCell) -> &String| {
+        interval.as_ref().map_or(String::new(), |[low, high]| format!("{} to {}", of(low), of(high)))
+    };
+    let interval =
+        TableCell { shown: text(|cell| &cell.shown), exact: text(|cell| &cell.exact), is_number: true };
+    [real(estimate.value.map(|value| factor * value), digits), interval]
+}
+
+fn probability_cell(p: Option<f64>) -> TableCell {
+    TableCell { shown: probability(p), ..real(p, 3) }
+}

@@ -1,0 +1,179 @@
+//! The comparison of biased walks with their controls, in words.
+
+use monitor::label_statistics::comparison::{
+    ConfidenceEstimate, MIN_UNITS, PairCounts, PairedErrors, PairedTests, ResampledUnit, ResamplingUnits,
+    WalkComparison,
+};
+
+use crate::output::{count, decimals};
+
+/// What the numbers of a comparison are of: the pairs, the intervals, samples. Sentences without a full stop.
+pub fn notes(comparison: &WalkComparison) -> Vec<String> {
+    let mut notes = vec![pairs(&comparison.pairs)];
+    notes.extend(left_out(&comparison.pairs.counts));
+    let has_pairs = comparison.pairs.counts.pairs > 0;
+    let matched = intervals(&comparison.pairs.units, comparison);
+    let pooled = intervals(&comparison.pooled.all.units, comparison);
+    match has_pairs {
+        true if matched == pooled => notes.push(matched),
+        true => notes.extend([format!("matched: {matched}"), format!("pooled: {pooled}")]),
+        false => notes.push(pooled),
+    }
+    if has_pairs {
+        notes.extend(by_unit(&comparison.pairs));
+    }
+    if comparison.pooled.all.units.resampled.is_some() {
+        notes.push(format!(
+            "no interval where fewer than {MIN_UNITS} of the units that the bootstrap draws have the element, or an error above the threshold"
+        ));
+    }
+    notes.extend(sampled(comparison));
+    notes
+}
+
+/// The pairs, or why there are none.
+pub fn pairs(pairs: &PairedErrors) -> String {
+    if pairs.counts.pairs == 0 {
+        return "no pairs: no labelled candidate of a biased walk has a labelled control frame at its step"
+            .into();
+    }
+    let ResamplingUnits { seed_structures, walks, .. } = pairs.units;
+    format!(
+        "{} of {} and {}",
+        count(pairs.counts.pairs, "pair"),
+        count(seed_structures as u64, "seed structure"),
+        count(walks as u64, "biased walk")
+    )
+}
+
+/// What is not among the pairs.
+fn left_out(counts: &PairCounts) -> Option<String> {
+    let PairCounts {
+        same_structure,
+        biased_failed,
+        control_failed,
+        both_failed,
+        biased_alone,
+        control_alone,
+        ..
+    } = *counts;
+    let parts = [
+        (same_structure, "that are one structure"),
+        (biased_failed, "whose biased label failed"),
+        (control_failed, "whose control label failed"),
+        (both_failed, "whose labels both failed"),
+    ];
+    let mut parts: Vec<_> = parts
+        .into_iter()
+        .filter(|(number, _)| *number > 0)
+        .map(|(number, why)| format!("{} {why}", count(number, "pair")))
+        .collect();
+    if biased_alone + control_alone > 0 {
+        let (biased, control) =
+            (count(biased_alone, "biased structure"), count(control_alone, "control frame"));
+        parts.push(format!("{biased} and {control} without a labelled or failed partner"));
+    }
+    (!parts.is_empty()).then(|| format!("not among the pairs: {}", parts.join(", ")))
+}
+
+/// How the intervals of a group came about, or why there are none.
+pub fn intervals(units: &ResamplingUnits, comparison: &WalkComparison) -> String {
+    let ResamplingUnits { resampled, seed_structures, walks } = *units;
+    let (seeds, walks) =
+        (count(seed_structures as u64, "seed structure"), count(walks as u64, "biased walk"));
+    let level = 100.0 * comparison.level;
+    match resampled {
+        Some(ResampledUnit::SeedStructures) => {
+            format!("{level} % intervals by bootstrap over {seeds} ({} draws)", comparison.draws)
+        }
+        Some(ResampledUnit::Walks) => format!(
+            "{level} % intervals by bootstrap over {walks}, each with its control ({} draws), since {seeds} are too few (at least \
+             {MIN_UNITS}); walks from one seed structure resemble each other, so the intervals may be too narrow",
+            comparison.draws
+        ),
+        None => format!(
+            "no intervals: {seeds} and {walks} are too few for a bootstrap (at least {MIN_UNITS} of either)"
+        ),
+    }
+}
+
+/// The tests with one difference for each unit. `None` without resampled units.
+fn by_unit(pairs: &PairedErrors) -> Option<String> {
+    let unit = match pairs.units.resampled? {
+        ResampledUnit::SeedStructures => "seed structure",
+        ResampledUnit::Walks => "biased walk",
+    };
+    let tests = &pairs.force_mae.tests_by_unit;
+    Some(format!(
+        "force MAE with one difference for each {unit}, since its pairs are not independent: larger on the biased side in {} of {}, \
+         Wilcoxon p {}, sign test p {}",
+        tests.biased_larger,
+        tests.biased_larger + tests.control_larger,
+        probability(tests.wilcoxon_p),
+        probability(tests.sign_p)
+    ))
+}
+
+/// The samples of a very large campaign.
+fn sampled(comparison: &WalkComparison) -> Option<String> {
+    let WalkComparison { structures, sampled_structures, atoms, sampled_atoms, .. } = comparison;
+    (sampled_structures < structures || sampled_atoms < atoms).then(|| {
+        format!(
+            "the comparison is of samples: {sampled_structures} of {structures} structures, {sampled_atoms} of {atoms} atoms"
+        )
+    })
+}
+
+/// The numbers of pairs in which either side is larger, `60 of 71`.
+pub fn larger(tests: &PairedTests) -> String {
+    format!("{} of {}", tests.biased_larger, tests.biased_larger + tests.control_larger)
+}
+
+/// A probability, with two digits where it is small.
+pub fn probability(p: Option<f64>) -> String {
+    match p {
+        Some(p) if p < 1e-3 => format!("{p:.1e}"),
+        p => decimals(p, 3),
+    }
+}
+
+/// The range of a median whatever the errors of failed labels are: `0.610 to 0.720`, or without an upper end `at least 0.610`.
+pub fn median_range(range: (f64, Option<f64>), places: usize) -> String {
+    match range {
+        (low, Some(high)) => format!("{low:.places$} to {high:.places$}"),
+        (low, None) => format!("at least {low:.places$}"),
+    }
+}
+
+/// An estimate with its interval, times a factor: `0.680 (0.610 to 0.720)`.
+pub fn estimate(estimate: &ConfidenceEstimate, factor: f64, places: usize) -> String {
+    let value = decimals(estimate.value.map(|x| factor * x), places);
+    match estimate.interval {
+        Some((low, high)) => format!("{value} ({:.places$} to {:.places$})", factor * low, factor * high),
+        None => value,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_have_the_digits_that_matter() {
+        let found = ConfidenceEstimate { value: Some(0.68), interval: Some((0.61, 0.7249)) };
+        assert_eq!(estimate(&found, 1.0, 3), "0.680 (0.610 to 0.725)");
+        assert_eq!(estimate(&ConfidenceEstimate::default(), 1.0, 3), "–");
+        assert_eq!(["2.6e-9", "0.039", "–"], [Some(2.6e-9), Some(0.039), None].map(probability));
+        assert_eq!(median_range((0.6, None), 2), "at least 0.60");
+    }
+
+    #[test]
+    fn what_is_missing_is_said() {
+        assert_eq!(left_out(&PairCounts { pairs: 9, ..PairCounts::default() }), None);
+        let counts =
+            PairCounts { same_structure: 2, control_failed: 1, biased_alone: 1, ..PairCounts::default() };
+        let expected = "not among the pairs: 2 pairs that are one structure, 1 pair whose control label failed, 1 biased structure and \
+                        0 control frames without a labelled or failed partner";
+        assert_eq!(left_out(&counts).as_deref(), Some(expected));
+    }
+}
