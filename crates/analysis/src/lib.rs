@@ -21,6 +21,7 @@ mod quantiles;
 mod random;
 mod rank_statistics;
 mod ranked_errors;
+mod row_space;
 mod systematic_sample;
 mod wilson;
 
@@ -42,5 +43,6 @@ pub use principal::PrincipalAxes;
 pub use quantiles::quantile;
 pub use rank_statistics::{roc_auc, spearman};
 pub use ranked_errors::{RankStatistics, RankedErrors};
+pub use row_space::{RowSpace, singular_values};
 pub use systematic_sample::SystematicSample;
 pub use wilson::wilson_interval;

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use atoms::{Evaluation, Structure};
+use atoms::{Evaluation, NeighbourList, Structure};
 use calm::neighbourhood::{Pair, PairError};
 use calm::{GradeError, Grades, Mixture, NeighbourWeights, neighbourhood_average};
 use potentials::grace::{GraceModel, PullBack};
@@ -56,6 +56,11 @@ impl Scorer {
             evaluation: Evaluation::default(),
             pull_back: PullBack::default(),
         }
+    }
+
+    /// Neighbours in the last structure within the cutoff of the model.
+    pub fn neighbours(&self) -> &NeighbourList {
+        &self.features.neighbours
     }
 
     /// Features z of the last structure, [n × D].
