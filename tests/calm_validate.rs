@@ -27,12 +27,12 @@ fn baselines(here: &Path, arguments: &[&str]) {
     succeed(here, start.iter().chain(arguments));
 }
 
-/// Builds a mixture over the linear features of the aluminium model from four of its training structures.
-fn linear_mixture(here: &Path, output: &str) {
+/// Builds a mixture over other features of the aluminium model from four of its training structures.
+fn mixture_of(here: &Path, variant: &str, output: &str) {
     write_frames(&here.join("train.extxyz"), &aluminium(4));
     let model = config("data/al_eam_1l/kokkos.npz");
     let build = ["calm", "build", "--model", model.to_str().unwrap(), "train.extxyz", "--output", output];
-    succeed(here, build.iter().chain(&["--feature-variant", "linear", "--candidates", "1"]));
+    succeed(here, build.iter().chain(&["--feature-variant", variant, "--candidates", "1"]));
 }
 
 /// Labelled structures from the training data of the aluminium model.
@@ -386,16 +386,18 @@ fn baselines_are_scanned_beside_the_grade() {
 fn further_mixtures_are_scanned_beside_the_grade() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    linear_mixture(here, "linear.npz");
+    mixture_of(here, "linear", "linear.npz");
     let own = config("data/al_eam_1l/gmm_artifacts.npz").display().to_string();
-    let others = ["--compare-artifact", "linear.npz", "--compare-artifact", &own];
+    mixture_of(here, "hidden", "hidden.npz");
+    let others = ["linear.npz", &own, "hidden.npz"].map(|file| ["--compare-artifact", file]).concat();
     let quick = ["--scan-steps", "4", "--no-relax", "--collision-evaluations", "0"];
     let text = validate(here, "al_eam_1l", "out", &[&quick[..], &others[..]].concat());
     assert!(text.contains("γ (linear)"), "{text}");
     let found = json(&here.join("out"));
     let scores = found["scores"].as_array().unwrap();
     let described: Vec<_> = scores.iter().map(|score| json!([score["name"], score["rule"]])).collect();
-    let expected = ["γ", "γ (linear)", "γ (gmm_artifacts)"].map(|name| json!([name, {"threshold": 1.0}]));
+    let expected =
+        ["γ", "γ (linear)", "γ (gmm_artifacts)", "γ (hidden)"].map(|name| json!([name, {"threshold": 1.0}]));
     assert_eq!(described, expected);
     assert_eq!(scores[2]["detection"], scores[0]["detection"]);
     assert_eq!(found["labelled"], json!([]));
@@ -408,13 +410,25 @@ fn further_mixtures_are_scanned_beside_the_grade() {
         Frame::from(Prototype::Fcc.structure("Al".parse().unwrap(), point["distance"].as_f64().unwrap()))
     };
     write_frames(&here.join("in.extxyz"), &graded.iter().map(crystal).collect::<Vec<_>>());
-    score(here, "in.extxyz", &["--artifact", "linear.npz"]);
-    let scored = read_extxyz(&here.join("scored.extxyz")).unwrap();
-    let largest =
-        |frame: &Frame| frame.arrays["gamma"].reals().unwrap().into_iter().fold(f64::NEG_INFINITY, f64::max);
-    let expected: Vec<_> = scored.iter().map(largest).collect();
-    let scanned: Vec<_> = graded.iter().map(|point| point["scores"][1].as_f64().unwrap()).collect();
-    assert!(graded.len() > 1 && deviation(&scanned, &expected) < 1e-6, "{scanned:?} {expected:?}");
+    for (artifact, k) in [("linear.npz", 1), ("hidden.npz", 3)] {
+        score(here, "in.extxyz", &["--artifact", artifact]);
+        let scored = read_extxyz(&here.join("scored.extxyz")).unwrap();
+        let largest = |frame: &Frame| {
+            frame.arrays["gamma"].reals().unwrap().into_iter().fold(f64::NEG_INFINITY, f64::max)
+        };
+        let expected: Vec<_> = scored.iter().map(largest).collect();
+        let scanned: Vec<_> = graded.iter().map(|point| point["scores"][k].as_f64().unwrap()).collect();
+        assert!(graded.len() > 1 && deviation(&scanned, &expected) < 1e-6, "{scanned:?} {expected:?}");
+    }
+    // A mixture of the hidden layer grades its own data, and is none of the model’s own features.
+    score(here, "train.extxyz", &["--artifact", "hidden.npz"]);
+    let gamma: Vec<_> = read_extxyz(&here.join("scored.extxyz")).unwrap();
+    let gamma: Vec<_> = gamma.iter().flat_map(|frame| frame.arrays["gamma"].reals().unwrap()).collect();
+    let above = gamma.iter().filter(|gamma| **gamma > 1.0).count();
+    assert!(!gamma.is_empty() && above < gamma.len() / 10, "{above} of {}", gamma.len());
+    let model = config("data/al_eam_1l/kokkos.npz").display().to_string();
+    let start = ["calm", "validate", "--model", &model, "--output", "x", "--artifact", "hidden.npz"];
+    assert!(refuse(here, start).contains("hidden.npz: grades the hidden layer"));
     // Two files of one name are told apart by their directories.
     std::fs::create_dir(here.join("copy")).unwrap();
     std::fs::copy(here.join("linear.npz"), here.join("copy/linear.npz")).unwrap();
@@ -517,7 +531,7 @@ fn mixtures_of_several_dimensions_are_compared() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let model = config("data/al_eam_1l/kokkos.npz").display().to_string();
-    linear_mixture(here, "linear.npz");
+    mixture_of(here, "linear", "linear.npz");
     write_frames(&here.join("labelled.extxyz"), &aluminium(4));
     let own = config("data/al_eam_1l/gmm_artifacts.npz").display().to_string();
     let others = ["--compare-artifact", &own, "--compare-artifact", "linear.npz"];

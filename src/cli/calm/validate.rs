@@ -12,7 +12,7 @@ use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
 use super::other_scores::OtherScores;
-use super::score::load;
+use super::score::{load, load_any};
 use super::validate_labels::{self, LabelledComparison, NamedMixture};
 use crate::atomic_file::refuse_to_replace;
 use crate::calm_validation::labelled::LabelledSet;
@@ -172,7 +172,7 @@ impl CalmValidateArgs {
         let file = self.artifact.as_ref().unwrap_or(&self.model).clone();
         let mut mixtures = vec![NamedMixture { file, features: own.clone(), mixture: mixture.clone() }];
         for path in &self.compare_artifact {
-            let (features, artifact) = load(&self.model, Some(path))?;
+            let (features, artifact) = load_any(&self.model, Some(path))?;
             let mixture = Arc::new(artifact.mixture);
             mixtures.push(NamedMixture { file: path.clone(), features, mixture });
         }

@@ -33,7 +33,7 @@ pub struct NamedMixture {
 impl NamedMixture {
     /// The model and the mixture, with work arrays.
     pub fn scorer(&self) -> Scorer {
-        Scorer::new(self.features.model.clone(), self.mixture.clone())
+        Scorer::new(&self.features, self.mixture.clone())
     }
 }
 
