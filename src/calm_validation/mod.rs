@@ -51,7 +51,7 @@ pub use self::progress::ValidationProgress;
 pub use self::solutions::Solution;
 pub use self::tables::{both, verdict};
 pub use self::text::{PAGE, files};
-pub use self::training::TrainingData;
+pub use self::training::TrainingCompositions;
 
 /// What is tested, and how closely.
 #[derive(Clone, Debug, Serialize)]
@@ -103,7 +103,7 @@ pub struct Validation {
     /// What labelled structures say, one for each file of them.
     pub labelled: Vec<LabelledSet>,
     /// What the training data have, if they were given.
-    pub training: Option<TrainingData>,
+    pub training: Option<TrainingCompositions>,
 }
 
 /// A score and what its bond scans show.
@@ -131,7 +131,7 @@ pub struct LabelledResults {
     /// One for each file of labelled structures.
     pub sets: Vec<LabelledSet>,
     /// What the training data have, if they were given.
-    pub training: Option<TrainingData>,
+    pub training: Option<TrainingCompositions>,
     /// Components of the mixture, with labelled atoms if there are any.
     pub planes: FeaturePlanes,
 }

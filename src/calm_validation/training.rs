@@ -10,7 +10,7 @@ use super::solutions::lattice;
 
 /// Training structures of the pairs of elements.
 #[derive(Clone, Debug, Serialize)]
-pub struct TrainingData {
+pub struct TrainingCompositions {
     /// Structures read.
     pub structures: u64,
     /// One for each pair of elements.
@@ -48,7 +48,7 @@ pub struct TrainingShell {
     pub atoms: u64,
 }
 
-impl TrainingData {
+impl TrainingCompositions {
     /// Nothing yet.
     pub fn new(pairs: &[[Species; 2]]) -> Self {
         let pair = |species: &[Species; 2]| TrainingPair {
@@ -122,7 +122,7 @@ mod tests {
     #[test]
     fn structures_and_first_shells_of_a_pair_are_counted() {
         let [mo, w, si] = ["Mo", "W", "Si"].map(|symbol| symbol.parse::<Species>().unwrap());
-        let mut training = TrainingData::new(&[[mo, w]]);
+        let mut training = TrainingCompositions::new(&[[mo, w]]);
         let mut list = NeighbourList::new(5.0, 0.0);
         let pure = Prototype::Bcc.structure(mo, 2.7);
         let mut ordered = pure.clone();

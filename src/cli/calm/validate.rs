@@ -17,8 +17,8 @@ use super::validate_labels::{self, LabelledComparison, NamedMixture};
 use crate::atomic_file::refuse_to_replace;
 use crate::calm_validation::labelled::LabelledSet;
 use crate::calm_validation::{
-    self, AtomScore, EnergySpread, FeaturePlanes, LabelledResults, MixtureScore, PAGE, Subject, TrainingData,
-    Validation, ValidationProgress, ValidationSettings, both, labelled, verdict,
+    self, AtomScore, EnergySpread, FeaturePlanes, LabelledResults, MixtureScore, PAGE, Subject,
+    TrainingCompositions, Validation, ValidationProgress, ValidationSettings, both, labelled, verdict,
 };
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureModel;
@@ -208,7 +208,7 @@ impl CalmValidateArgs {
             sets.push(set);
         }
         if !self.training.is_empty() {
-            let empty = TrainingData::new(&settings.pairs);
+            let empty = TrainingCompositions::new(&settings.pairs);
             training = validate_labels::training(&self.training, &mut own.scorer(), empty, stop)?;
             if training.is_none() {
                 return Ok(None);

@@ -12,7 +12,7 @@ use super::other_scores::OtherScores;
 use super::score_labels::ScoreLabels;
 use super::scorer::Scorer;
 use crate::calm_validation::labelled::{ComparedMixture, ComparedModel, LabelledReport, LabelledSet};
-use crate::calm_validation::{FeaturePlanes, TrainingData};
+use crate::calm_validation::{FeaturePlanes, TrainingCompositions};
 use crate::cli::CommandError;
 use crate::feature_variant::FeatureModel;
 use crate::output::{self, Bar};
@@ -107,9 +107,9 @@ fn report(
 pub fn training(
     inputs: &[PathBuf],
     scorer: &mut Scorer,
-    mut training: TrainingData,
+    mut training: TrainingCompositions,
     stop: &CancellationToken,
-) -> Result<Option<TrainingData>, CommandError> {
+) -> Result<Option<TrainingCompositions>, CommandError> {
     let mut labels = ScoreLabels::new(Vec::new(), None)?;
     for input in inputs {
         let add = |scorer: &Scorer, frame: &Frame| {
