@@ -79,12 +79,15 @@ impl FeatureModel {
         Some(Self { model: model.with_features(form)?.into(), is_hidden: false })
     }
 
-    /// The variant of the model of `path` whose features an artifact has: the file's own, or another with the same matrix. The file's own
-    /// if none fits. A model without a projection gets that of the artifact.
+    /// The variant of the model of `path` whose features an artifact has: the file's own, another with the same matrix, or the hidden
+    /// layer. The file's own if none fits. A model without a projection gets that of the artifact.
     ///
     /// # Errors
     /// A model of another basis.
     pub fn for_artifact(path: &Path, model: GraceModel, artifact: &Projection) -> Result<Self, CommandError> {
+        if *artifact == unchanged(model.hidden_dimension()) {
+            return Ok(Self { model: model.into(), is_hidden: true });
+        }
         if model.projection().is_none() {
             let model = with_projection(model, artifact)
                 .map_err(|error| CommandError::Input(format!("{}: {error}", path.display())))?;
@@ -122,6 +125,17 @@ impl FeatureModel {
     /// D
     pub fn dimension(&self) -> usize {
         if self.is_hidden { self.model.hidden_dimension() } else { self.model.feature_dimension() }
+    }
+
+    /// Whether the features are the hidden layer.
+    pub fn is_hidden(&self) -> bool {
+        self.is_hidden
+    }
+
+    /// The projection in an artifact of these features: theirs, or for the hidden layer, which is no projection of the basis, one that
+    /// changes nothing.
+    pub fn stored_projection(&self) -> Option<Projection> {
+        if self.is_hidden { Some(unchanged(self.dimension())) } else { self.projection() }
     }
 
     /// How the features follow from the basis; `None` for the hidden layer.
@@ -182,6 +196,22 @@ pub fn with_projection(model: GraceModel, projection: &Projection) -> Result<Gra
         asinh: projection.asinh,
         layers,
     })
+}
+
+/// The projection of the hidden layer: the identity.
+fn unchanged(dimension: usize) -> Projection {
+    let mut matrix = vec![0.0; dimension * dimension];
+    matrix.iter_mut().step_by(dimension + 1).for_each(|x| *x = 1.0);
+    Projection {
+        matrix,
+        rows: dimension,
+        columns: dimension,
+        feature_dimension: dimension,
+        asinh: false,
+        normalised: false,
+        density_channels: false,
+        density_scale: 1.0,
+    }
 }
 
 /// The name of the features of a projection.

@@ -92,6 +92,17 @@ impl FeatureCalculator {
         }
     }
 
+    /// The derivatives of the last structure's energy and, with a cotangent, those of its features as in [`Self::pull_back`].
+    pub fn backward(&mut self, cotangent: Option<&[f64]>, energy: &mut Evaluation, out: &mut PullBack) {
+        match cotangent.filter(|_| self.hidden.is_some()) {
+            None => self.grace.backward(cotangent, energy, out),
+            Some(cotangent) => {
+                self.grace.backward(None, energy, out);
+                self.grace.pull_back_hidden_layer(cotangent, out);
+            }
+        }
+    }
+
     /// Gradient of the sum of the last structure's features with respect to the coordinates of its atoms, [3n × D], 1/Å. Takes D
     /// reverse sweeps.
     pub fn force_rows(&mut self) -> Vec<f64> {

@@ -227,7 +227,7 @@ fn what_does_not_belong_together_is_refused() {
         ),
         (
             &["b.npz", "--kind", "llpr", "--feature-variant", "hidden", "--artifact", &artifact],
-            "no artifact has the features of the hidden layer",
+            "its feature dimension is 130",
         ),
         (
             &["b.npz", "--kind", "llpr", "--regularisation", "0"],

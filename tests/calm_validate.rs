@@ -27,12 +27,12 @@ fn baselines(here: &Path, arguments: &[&str]) {
     succeed(here, start.iter().chain(arguments));
 }
 
-/// Builds a mixture over the linear features of the aluminium model from four of its training structures.
-fn linear_mixture(here: &Path, output: &str) {
+/// Builds a mixture over other features of the aluminium model from four of its training structures.
+fn mixture_of(here: &Path, variant: &str, output: &str) {
     write_frames(&here.join("train.extxyz"), &aluminium(4));
     let model = config("data/al_eam_1l/kokkos.npz");
     let build = ["calm", "build", "--model", model.to_str().unwrap(), "train.extxyz", "--output", output];
-    succeed(here, build.iter().chain(&["--feature-variant", "linear", "--candidates", "1"]));
+    succeed(here, build.iter().chain(&["--feature-variant", variant, "--candidates", "1"]));
 }
 
 /// Labelled structures from the training data of the aluminium model.
@@ -73,7 +73,7 @@ fn contents(directory: &Path) -> Vec<(String, Vec<u8>)> {
 fn a_model_of_one_element_is_tested_completely() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    let quick = ["--scan-steps", "16", "--no-relax", "--collision-evaluations", "20"];
+    let quick = ["--scan-steps", "16", "--no-relax", "--collision-evaluations", "100"];
     let text = validate(here, "al_eam_1l", "first", &quick);
     assert!(text.contains("Al") && text.contains("yes/yes") && text.contains("fcc (111)"), "{text}");
     let found = json(&here.join("first"));
@@ -114,6 +114,7 @@ fn a_model_of_one_element_is_tested_completely() {
     let pair = &found["collisions"][0]["features"][0];
     assert!(pair["distance"].as_f64().unwrap() > 1e3 * pair["rounding"].as_f64().unwrap(), "{pair}");
     searches_come_closer(&here.join("first"), &found["matched_pairs"]);
+    ranks_are_bounded(&found["feature_ranks"]);
 
     let files = contents(&here.join("first"));
     let names: Vec<_> = files.iter().map(|(name, _)| name.as_str()).collect();
@@ -142,22 +143,46 @@ fn a_model_of_one_element_is_tested_completely() {
     assert!(files == contents(&here.join("second")), "the same bytes");
 }
 
+/// The hidden layer is a function of nine densities; all atoms together tell every direction but translations and rotations.
+fn ranks_are_bounded(ranks: &Value) {
+    let number = |rank: &Value, key: &str| rank[key].as_u64().unwrap();
+    let described: Vec<_> = ranks.as_array().unwrap().iter().map(|rank| number(rank, "atoms")).collect();
+    assert_eq!(described, [1, 51, 1, 51]);
+    for rank in ranks.as_array().unwrap() {
+        assert_eq!(rank["directions"], 3 * 51 - 6);
+        assert!(rank["smallest"].as_f64() > rank["next"].as_f64(), "{rank}");
+        let full = if number(rank, "atoms") == 1 { number(rank, "dimension").min(147) } else { 147 };
+        assert!((1..=full).contains(&number(rank, "rank")), "{rank}");
+    }
+    assert!(number(&ranks[0], "rank") <= 9 && number(&ranks[2], "rank") > 100, "{ranks}");
+    assert_eq!([1, 3].map(|k| number(&ranks[k], "rank")), [147; 2]);
+}
+
 /// Each search from an allowed start brings the features of both environments closer, and its pair is in the file.
 fn searches_come_closer(output: &Path, pairs: &Value) {
     let described: Vec<_> = pairs.as_array().unwrap().iter().map(|pair| &pair["neighbours"]).collect();
     // Nine densities can tell environments of three neighbours apart.
-    assert_eq!(described, [50, 50, 3, 50, 50]);
+    assert_eq!(described, [50, 50, 3, 50, 50, 50]);
     for pair in pairs.as_array().unwrap() {
         let number = |key: &str| pair[key].as_f64().unwrap();
         let is_closer = number("distance") < number("start_distance");
         assert!(is_closer || pair["start"] != "unrelated", "{pair}");
-        assert!(pair["evaluations"].as_u64().unwrap() <= 20 && pair["is_different"].is_boolean(), "{pair}");
+        assert!(pair["evaluations"].as_u64().unwrap() <= 100 && pair["is_different"].is_boolean(), "{pair}");
     }
     let frames = read_extxyz(&output.join("collisions.extxyz")).unwrap();
     let atoms: Vec<_> = frames.iter().map(|frame| frame.structure.len()).collect();
-    assert_eq!(atoms, [51, 51, 51, 51, 4, 4, 51, 51, 51, 51]);
+    assert_eq!(atoms, [51, 51, 51, 51, 4, 4, 51, 51, 51, 51, 51, 51]);
     let table = std::fs::read_to_string(output.join("tables/collision-search.csv")).unwrap();
-    assert_eq!(table.lines().count(), 6, "{table}");
+    assert_eq!(table.lines().count(), 7, "{table}");
+    // The walk moves the neighbours, and the hidden layer stays.
+    let walk = &pairs[5];
+    assert!(walk["start"] == "null_space" && walk["is_different"] == true, "{walk}");
+    assert!(
+        walk["distance"].as_f64().unwrap() <= 1e-9 && walk["superposed"].as_f64().unwrap() > 0.03,
+        "{walk}"
+    );
+    let [a, b] = [0, 1].map(|k| walk["energies"][k].as_f64().unwrap());
+    assert!((a - b).abs() < 1e-7 * a.abs().max(1.0), "{walk}");
 }
 
 #[test]
@@ -179,13 +204,18 @@ fn solid_solutions_are_scanned_for_models_of_several_elements() {
         "--pairs",
         "Ni-Al",
     ];
-    let labelled = read_extxyz(&config("data/ni_al_h_eam_1l/seed_frames.extxyz")).unwrap();
-    let labelled: Vec<_> = labelled.into_iter().step_by(9).collect();
+    let frames = read_extxyz(&config("data/ni_al_h_eam_1l/seed_frames.extxyz")).unwrap();
+    let [labelled, second] = [0, 1].map(|k| frames.iter().skip(k).step_by(9).cloned().collect::<Vec<_>>());
     write_frames(&here.join("labelled.extxyz"), &labelled);
-    let labels = ["--labelled", "labelled.extxyz"];
+    write_frames(&here.join("second.extxyz"), &second);
+    let labels = ["--labelled", "labelled.extxyz", "second.extxyz", "--training", "labelled.extxyz"];
+    let labels = [&labels[..], &["--compare-model", model.to_str().unwrap()]].concat();
     validate(here, "ni_al_h_eam_1l", "out", &[&only[..], &ensemble[..], &labels[..]].concat());
     let found = json(&here.join("out"));
-    errors_are_divided(&found["labelled"], &labelled);
+    errors_are_divided(&found["labelled"][0]["report"], &labelled);
+    errors_are_divided(&found["labelled"][1]["report"], &second);
+    sets_are_beside_each_other(&here.join("out"), &found);
+    training_data_are_counted(&found, &labelled);
     let page = std::fs::read_to_string(here.join("out/validation.html")).unwrap();
     assert!(
         page.contains("id=\"figure-composition-errors\"") && page.contains("id=\"table-element-errors\"")
@@ -210,6 +240,59 @@ fn solid_solutions_are_scanned_for_models_of_several_elements() {
     let atoms: u64 =
         solution["first_shells"].as_array().unwrap().iter().map(|of| of["atoms"].as_u64().unwrap()).sum();
     assert_eq!(atoms, 11 * 128);
+}
+
+/// Two sets have figures and tables of their own, and common ones.
+fn sets_are_beside_each_other(output: &Path, found: &Value) {
+    let sets = found["labelled"].as_array().unwrap();
+    let files: Vec<_> = sets.iter().map(|set| &set["file"]).collect();
+    assert_eq!(files, ["labelled.extxyz", "second.extxyz"]);
+    for set in sets {
+        // The same model once more.
+        assert_eq!(set["models"][0]["average"], set["report"]["scores"][1]);
+    }
+    for file in ["figures/reliability", "figures/composition-errors", "tables/ranks", "tables/label-errors"] {
+        let [first, second] =
+            ["", "-2"].map(|set| std::fs::read(output.join(format!("{file}{set}.csv"))).unwrap());
+        assert!(first != second, "{file}");
+    }
+    let rows = std::fs::read_to_string(output.join("tables/labelled-sets.csv")).unwrap();
+    let scores = sets[0]["report"]["scores"].as_array().unwrap();
+    assert_eq!(rows.lines().count(), 1 + 2 * scores.len(), "{rows}");
+    for (set, row) in sets.iter().zip(rows.lines().skip(1)) {
+        let rho: f64 = row.split(',').nth(6).unwrap().parse().unwrap();
+        assert!((rho - set["report"]["scores"][0]["spearman"]["value"].as_f64().unwrap()).abs() < 1e-12);
+    }
+    // Two models and two sets.
+    let grid = std::fs::read_to_string(output.join("figures/error-grid.svg")).unwrap();
+    assert_eq!(grid.matches(": second.extxyz<").count(), 2, "{grid}");
+    let page = std::fs::read_to_string(output.join("validation.html")).unwrap();
+    assert!(
+        page.contains("<h2>Further labelled structures</h2>") && page.contains("id=\"figure-reliability-2\"")
+    );
+    assert_eq!(page.matches("id=\"reliability-clip-1\"").count(), 1);
+}
+
+/// The training data of the test are its first labelled set.
+fn training_data_are_counted(found: &Value, frames: &[Frame]) {
+    let training = &found["training"];
+    let report = &found["labelled"][0]["report"];
+    assert_eq!(training["structures"], frames.len());
+    assert_eq!(training["errors"]["energy"], report["energy_without_offsets"]["mean_absolute"]["value"]);
+    let force = training["errors"]["force"].as_f64().unwrap();
+    // |F| is at least the mean of its three components' sizes, and at most their sum.
+    let component = report["forces"]["mean_absolute"]["value"].as_f64().unwrap();
+    assert!((1.0..=3.0).contains(&(force / component)), "{force} {component}");
+    let is_of_pair = |frame: &&Frame| {
+        frame.structure.species.iter().all(|species| ["Ni", "Al"].contains(&species.symbol()))
+    };
+    let of_pair: Vec<_> = frames.iter().filter(is_of_pair).collect();
+    let pair = &training["pairs"][0];
+    assert_eq!(pair["structures"], of_pair.len());
+    let shells = pair["shells"].as_array().unwrap();
+    let atoms: u64 = shells.iter().map(|shell| shell["atoms"].as_u64().unwrap()).sum();
+    let all: usize = of_pair.iter().map(|frame| frame.structure.len()).sum();
+    assert!(atoms > 0 && atoms as usize <= all, "{pair}");
 }
 
 /// Labelled structures and their atoms by composition and by element.
@@ -303,19 +386,21 @@ fn baselines_are_scanned_beside_the_grade() {
 fn further_mixtures_are_scanned_beside_the_grade() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    linear_mixture(here, "linear.npz");
+    mixture_of(here, "linear", "linear.npz");
     let own = config("data/al_eam_1l/gmm_artifacts.npz").display().to_string();
-    let others = ["--compare-artifact", "linear.npz", "--compare-artifact", &own];
+    mixture_of(here, "hidden", "hidden.npz");
+    let others = ["linear.npz", &own, "hidden.npz"].map(|file| ["--compare-artifact", file]).concat();
     let quick = ["--scan-steps", "4", "--no-relax", "--collision-evaluations", "0"];
     let text = validate(here, "al_eam_1l", "out", &[&quick[..], &others[..]].concat());
     assert!(text.contains("γ (linear)"), "{text}");
     let found = json(&here.join("out"));
     let scores = found["scores"].as_array().unwrap();
     let described: Vec<_> = scores.iter().map(|score| json!([score["name"], score["rule"]])).collect();
-    let expected = ["γ", "γ (linear)", "γ (gmm_artifacts)"].map(|name| json!([name, {"threshold": 1.0}]));
+    let expected =
+        ["γ", "γ (linear)", "γ (gmm_artifacts)", "γ (hidden)"].map(|name| json!([name, {"threshold": 1.0}]));
     assert_eq!(described, expected);
     assert_eq!(scores[2]["detection"], scores[0]["detection"]);
-    assert_eq!(found["mixtures"], json!([]));
+    assert_eq!(found["labelled"], json!([]));
 
     // `calm score` gives the same grades for the same crystals.
     let scan = &found["bond_scans"][0];
@@ -325,13 +410,25 @@ fn further_mixtures_are_scanned_beside_the_grade() {
         Frame::from(Prototype::Fcc.structure("Al".parse().unwrap(), point["distance"].as_f64().unwrap()))
     };
     write_frames(&here.join("in.extxyz"), &graded.iter().map(crystal).collect::<Vec<_>>());
-    score(here, "in.extxyz", &["--artifact", "linear.npz"]);
-    let scored = read_extxyz(&here.join("scored.extxyz")).unwrap();
-    let largest =
-        |frame: &Frame| frame.arrays["gamma"].reals().unwrap().into_iter().fold(f64::NEG_INFINITY, f64::max);
-    let expected: Vec<_> = scored.iter().map(largest).collect();
-    let scanned: Vec<_> = graded.iter().map(|point| point["scores"][1].as_f64().unwrap()).collect();
-    assert!(graded.len() > 1 && deviation(&scanned, &expected) < 1e-6, "{scanned:?} {expected:?}");
+    for (artifact, k) in [("linear.npz", 1), ("hidden.npz", 3)] {
+        score(here, "in.extxyz", &["--artifact", artifact]);
+        let scored = read_extxyz(&here.join("scored.extxyz")).unwrap();
+        let largest = |frame: &Frame| {
+            frame.arrays["gamma"].reals().unwrap().into_iter().fold(f64::NEG_INFINITY, f64::max)
+        };
+        let expected: Vec<_> = scored.iter().map(largest).collect();
+        let scanned: Vec<_> = graded.iter().map(|point| point["scores"][k].as_f64().unwrap()).collect();
+        assert!(graded.len() > 1 && deviation(&scanned, &expected) < 1e-6, "{scanned:?} {expected:?}");
+    }
+    // A mixture of the hidden layer grades its own data, and is none of the model’s own features.
+    score(here, "train.extxyz", &["--artifact", "hidden.npz"]);
+    let gamma: Vec<_> = read_extxyz(&here.join("scored.extxyz")).unwrap();
+    let gamma: Vec<_> = gamma.iter().flat_map(|frame| frame.arrays["gamma"].reals().unwrap()).collect();
+    let above = gamma.iter().filter(|gamma| **gamma > 1.0).count();
+    assert!(!gamma.is_empty() && above < gamma.len() / 10, "{above} of {}", gamma.len());
+    let model = config("data/al_eam_1l/kokkos.npz").display().to_string();
+    let start = ["calm", "validate", "--model", &model, "--output", "x", "--artifact", "hidden.npz"];
+    assert!(refuse(here, start).contains("hidden.npz: grades the hidden layer"));
     // Two files of one name are told apart by their directories.
     std::fs::create_dir(here.join("copy")).unwrap();
     std::fs::copy(here.join("linear.npz"), here.join("copy/linear.npz")).unwrap();
@@ -356,9 +453,10 @@ fn labelled_structures_have_a_section() {
     let (_, tables) = printed.split_once("\n\n").unwrap();
     assert!(tables.contains("Spearman’s ρ") && text.contains(tables), "{text}\n{tables}");
     let found = json(&here.join("out"));
-    assert_eq!(found["labelled"], read_json(&here.join("l.json")));
+    assert_eq!(found["labelled"][0]["report"], read_json(&here.join("l.json")));
+    let report = &found["labelled"][0]["report"];
     let names: Vec<_> =
-        found["labelled"]["scores"].as_array().unwrap().iter().map(|score| score["name"].clone()).collect();
+        report["scores"].as_array().unwrap().iter().map(|score| score["name"].clone()).collect();
     assert_eq!(json!(names), json!(["γ", "γ_{nbr}", "llpr", "llpr-nbr"]));
     let same = |file: &str, kind: &str| {
         let of_validation = std::fs::read(here.join("out").join(kind).join(file)).unwrap();
@@ -370,7 +468,7 @@ fn labelled_structures_have_a_section() {
     for figure in ["reliability.svg", "error-histograms.csv", "contamination.csv", "auc-sweep.png"] {
         same(figure, "figures");
     }
-    let rho = found["labelled"]["scores"][0]["spearman"]["value"].as_f64().unwrap();
+    let rho = report["scores"][0]["spearman"]["value"].as_f64().unwrap();
     let page = std::fs::read_to_string(here.join("out/validation.html")).unwrap();
     assert!(page.contains("<h2>Labelled structures</h2>") && page.contains("id=\"table-ranks\""));
     assert!(page.contains("id=\"table-auc-thresholds\"") && page.contains("id=\"figure-error-histograms\""));
@@ -386,7 +484,7 @@ fn labelled_structures_have_a_section() {
     };
     write_frames(&here.join("bare.extxyz"), &[Frame::from(aluminium(1).remove(0).structure)]);
     assert!(refused("new", "bare.extxyz").contains("bare.extxyz: no structure has a label"));
-    assert!(refused("out", "out/structures.extxyz").contains("is the file of labelled structures"));
+    assert!(refused("out", "out/structures.extxyz").contains("is a file of labelled structures"));
 }
 
 /// An artifact has the statistics of its data, from which the axes of the features follow; a mixture in a model's file has none.
@@ -407,8 +505,9 @@ fn labelled_atoms_are_drawn_among_the_components() {
     let shares = [0, 1].map(|k| plane["shares"][k].as_f64().unwrap());
     assert!(shares[0] >= shares[1] && shares[1] > 0.0 && shares[0] + shares[1] <= 1.0, "{plane}");
     let [within, beyond] = [0, 1].map(|k| plane["atoms"][k].as_u64().unwrap());
-    assert_eq!(json!(within + beyond), found["labelled"]["atoms"]);
-    let kept = found["labelled"]["scores"][0]["confident"]["retention"]["value"].as_f64().unwrap();
+    assert_eq!(json!(within + beyond), found["labelled"][0]["report"]["atoms"]);
+    let kept =
+        found["labelled"][0]["report"]["scores"][0]["confident"]["retention"]["value"].as_f64().unwrap();
     assert!((within as f64 / (within + beyond) as f64 - kept).abs() < 1e-12, "{plane}");
     // The axes go along the covariance of the only component, and its centroid is the origin.
     let [component] = &plane["components"].as_array().unwrap()[..] else { panic!("{plane}") };
@@ -432,7 +531,7 @@ fn mixtures_of_several_dimensions_are_compared() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let model = config("data/al_eam_1l/kokkos.npz").display().to_string();
-    linear_mixture(here, "linear.npz");
+    mixture_of(here, "linear", "linear.npz");
     write_frames(&here.join("labelled.extxyz"), &aluminium(4));
     let own = config("data/al_eam_1l/gmm_artifacts.npz").display().to_string();
     let others = ["--compare-artifact", &own, "--compare-artifact", "linear.npz"];
@@ -441,7 +540,7 @@ fn mixtures_of_several_dimensions_are_compared() {
     let printed = validate(here, "al_eam_1l", "out", &[&quick[..], &others[..]].concat());
     assert!(printed.contains("under several mixtures") && printed.contains("linear.npz"), "{printed}");
     let found = json(&here.join("out"));
-    let mixtures = found["mixtures"].as_array().unwrap();
+    let mixtures = found["labelled"][0]["mixtures"].as_array().unwrap();
     let described: Vec<_> =
         mixtures.iter().map(|mixture| json!([mixture["dimension"], mixture["components"]])).collect();
     assert_eq!(Value::from(described), json!([[130, [1]], [130, [1]], [128, [1]]]));
@@ -449,7 +548,7 @@ fn mixtures_of_several_dimensions_are_compared() {
         (&mixtures[1]["artifact"], &mixtures[1]["scores"]),
         (&own.as_str().into(), &mixtures[0]["scores"])
     );
-    assert_eq!(mixtures[0]["scores"], found["labelled"]["scores"]);
+    assert_eq!(mixtures[0]["scores"], found["labelled"][0]["report"]["scores"]);
     assert_ne!(mixtures[2]["scores"][0]["spearman"], mixtures[0]["scores"][0]["spearman"]);
     let table = std::fs::read_to_string(here.join("out/tables/mixtures.csv")).unwrap();
     assert_eq!(table.lines().count(), 7, "{table}");

@@ -5,6 +5,7 @@ mod data;
 mod elements;
 mod features;
 mod kills;
+mod memory;
 mod parts;
 mod projection;
 

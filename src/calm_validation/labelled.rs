@@ -9,13 +9,15 @@ mod estimate;
 mod figures;
 mod mixtures;
 mod report;
+mod sets;
 mod tables;
 #[cfg(test)]
 mod tests;
 
 pub use self::collect::{LabelledErrors, LabelledStructure, ScoreColumn};
 pub use self::estimate::BOOTSTRAP;
-pub use self::figures::{all as figures, mixture_map, mixtures as mixtures_figure};
+pub use self::figures::{all as figures, error_grid, mixture_map, mixtures as mixtures_figure};
 pub use self::mixtures::{ComparedMixture, table as mixtures_table};
-pub use self::report::LabelledReport;
+pub use self::report::{LabelledReport, TrainingErrors};
+pub use self::sets::{ComparedModel, LabelledSet, table as sets_table};
 pub use self::tables::{all as tables, write, write_table};

@@ -23,6 +23,7 @@ mod random;
 mod solutions;
 mod tables;
 mod text;
+mod training;
 
 use std::sync::Arc;
 
@@ -32,12 +33,13 @@ use md::Fire;
 use potentials::grace::GraceModel;
 use serde::Serialize;
 
-use self::labelled::{ComparedMixture, LabelledReport};
+use self::labelled::LabelledSet;
 use crate::exit_status::CommandError;
 
 pub use self::baseline_score::{BaselineScore, score_own_features};
 pub use self::bond_scans::BondScan;
 pub use self::collisions::octagon::Collision;
+pub use self::collisions::ranks::FeatureRank;
 pub use self::collisions::search::MatchedPair;
 pub use self::defects::Defect;
 pub use self::detection::{Detection, DetectionRule};
@@ -49,6 +51,7 @@ pub use self::progress::ValidationProgress;
 pub use self::solutions::Solution;
 pub use self::tables::{both, verdict};
 pub use self::text::{PAGE, files};
+pub use self::training::TrainingCompositions;
 
 /// What is tested, and how closely.
 #[derive(Clone, Debug, Serialize)]
@@ -93,12 +96,14 @@ pub struct Validation {
     pub collisions: Vec<Collision>,
     /// Pairs of environments found by minimisation.
     pub matched_pairs: Vec<MatchedPair>,
+    /// Directions that features of an environment tell apart.
+    pub feature_ranks: Vec<FeatureRank>,
     /// Components of the mixture and labelled atoms in the plane of the features; none without the statistics of an artifact.
     pub feature_planes: Vec<FeaturePlane>,
-    /// What labelled structures say, if there are any.
-    pub labelled: Option<LabelledReport>,
-    /// The same labelled structures under several mixtures, that of the scores first; empty if no other was given.
-    pub mixtures: Vec<ComparedMixture>,
+    /// What labelled structures say, one for each file of them.
+    pub labelled: Vec<LabelledSet>,
+    /// What the training data have, if they were given.
+    pub training: Option<TrainingCompositions>,
 }
 
 /// A score and what its bond scans show.
@@ -123,10 +128,10 @@ pub struct Subject {
 
 /// What was found with labelled structures before the tests without labels.
 pub struct LabelledResults {
-    /// `None` without labelled structures.
-    pub report: Option<LabelledReport>,
-    /// The same structures under several mixtures.
-    pub mixtures: Vec<ComparedMixture>,
+    /// One for each file of labelled structures.
+    pub sets: Vec<LabelledSet>,
+    /// What the training data have, if they were given.
+    pub training: Option<TrainingCompositions>,
     /// Components of the mixture, with labelled atoms if there are any.
     pub planes: FeaturePlanes,
 }
@@ -143,7 +148,8 @@ pub fn run(
             + defects::count(&settings)
             + solutions::count(&settings)
             + collisions::octagon::count(&settings)
-            + collisions::search::count(&settings),
+            + collisions::search::count(&settings)
+            + collisions::ranks::count(&settings),
     );
     let bond_scans = bond_scans::run(subject, &settings, progress);
     let [distances, of_others] = [true, false].map(|own| bond_scans::distances(&bond_scans, own));
@@ -151,6 +157,7 @@ pub fn run(
     let solutions = solutions::run(subject, &settings, &distances, progress)?;
     let collisions = collisions::octagon::run(subject, &settings, &distances, progress);
     let matched_pairs = collisions::search::run(subject, &settings, &distances, progress);
+    let feature_ranks = collisions::ranks::run(subject, &settings, &distances, progress);
     if progress.is_stopped() {
         return Ok(None);
     }
@@ -169,9 +176,10 @@ pub fn run(
         solutions,
         collisions,
         matched_pairs,
+        feature_ranks,
         feature_planes: labelled.planes.finish(),
-        labelled: labelled.report,
-        mixtures: labelled.mixtures,
+        labelled: labelled.sets,
+        training: labelled.training,
     }))
 }
 

@@ -80,7 +80,7 @@ pub fn count(settings: &ValidationSettings) -> usize {
 }
 
 /// The lattice: that of the first element if it is fcc or bcc, otherwise fcc.
-fn lattice([first, _]: [Species; 2]) -> (Prototype, Repetition, usize) {
+pub fn lattice([first, _]: [Species; 2]) -> (Prototype, Repetition, usize) {
     match first.ground_state().prototype {
         Prototype::Bcc => (Prototype::Bcc, Repetition([4, 4, 4]), 8),
         _ => (Prototype::Fcc, Repetition([4, 4, 2]), 12),

@@ -1,6 +1,8 @@
 //! The tables of the page.
 
 use super::detection::Detection;
+use super::labelled::LabelledSet;
+use super::text::of_set;
 use super::{DetectionRule, Validation, labelled};
 use crate::page::{PageTable, TableCell, count, percent, real, text};
 
@@ -11,14 +13,19 @@ pub fn all(validation: &Validation) -> Vec<PageTable> {
         bond_scans(validation),
         defects(validation),
         solutions(validation),
+        training(validation),
         feature_space(validation),
         collisions(validation),
         matched_pairs(validation),
+        feature_ranks(validation),
     ];
-    tables.extend(validation.labelled.iter().flat_map(labelled::tables));
-    tables.extend(
-        validation.labelled.iter().map(|report| labelled::mixtures_table(&validation.mixtures, report)),
-    );
+    tables.push(labelled::sets_table(&validation.labelled));
+    for (number, LabelledSet { report, mixtures, .. }) in validation.labelled.iter().enumerate() {
+        let mut tables_of_set = labelled::tables(report);
+        tables_of_set.push(labelled::mixtures_table(mixtures, report));
+        tables_of_set.iter_mut().for_each(|table| table.name = of_set(&table.name, number).into());
+        tables.extend(tables_of_set);
+    }
     tables.retain(|table| !table.rows.is_empty());
     tables
 }
@@ -199,6 +206,33 @@ fn solutions(validation: &Validation) -> PageTable {
     table
 }
 
+fn training(validation: &Validation) -> PageTable {
+    let caption = "Training structures of two elements alone, and the shares of the second element in them; mean absolute errors of the model on all \
+                   training structures with labels, of energies without the offsets of the elements and of forces as vectors.";
+    let titles = [
+        "elements",
+        "structures",
+        "smallest share (%)",
+        "largest share (%)",
+        "energy MAE (meV/atom)",
+        "force MAE (eV/Å)",
+    ];
+    let mut table = PageTable::new("training-data", caption, &titles);
+    let Some(training) = &validation.training else { return table };
+    let errors = training.errors;
+    for pair in &training.pairs {
+        table.rows.push(vec![
+            text(pair.elements.join("–")),
+            count(pair.structures),
+            percent(pair.range.map(|[low, _]| low)),
+            percent(pair.range.map(|[_, high]| high)),
+            real(errors.and_then(|errors| errors.energy).map(|error| 1000.0 * error), 2),
+            real(errors.and_then(|errors| errors.force), 3),
+        ]);
+    }
+    table
+}
+
 fn feature_space(validation: &Validation) -> PageTable {
     let caption = "Components of the mixture by element: their number, the share of the variance of all their data along the first two principal \
                    components, the largest condition number of a covariance; labelled atoms and the share of them with γ above 1.";
@@ -301,6 +335,38 @@ fn matched_pairs(validation: &Validation) -> PageTable {
             a,
             b,
             count(pair.evaluations as u64),
+        ]);
+    }
+    table
+}
+
+fn feature_ranks(validation: &Validation) -> PageTable {
+    let caption = "Rank of the Jacobian of features by the positions of the N atoms of environment A, of the atom in the middle or of all atoms. Of \
+                   the 3N − 6 directions without translations and rotations, those of the null space change no feature. Singular values \
+                   count above 10^{−10} of the largest.";
+    let titles = [
+        "element",
+        "features",
+        "of atoms",
+        "number of features",
+        "3N − 6",
+        "rank",
+        "null space",
+        "smallest that counts",
+        "largest that does not",
+    ];
+    let mut table = PageTable::new("feature-ranks", caption, &titles);
+    for rank in &validation.feature_ranks {
+        table.rows.push(vec![
+            text(&*rank.element),
+            text(rank.features.name()),
+            count(rank.atoms as u64),
+            count(rank.dimension as u64),
+            count(rank.directions as u64),
+            count(rank.rank as u64),
+            count(rank.free() as u64),
+            significant(Some(rank.smallest)),
+            significant(rank.next),
         ]);
     }
     table

@@ -2,7 +2,7 @@
 
 use atoms::extxyz::{Column, ColumnData, Frame, write_frame};
 
-use super::labelled::LabelledReport;
+use super::labelled::LabelledSet;
 use super::tables::both;
 use super::{Defect, MatchedPair, Validation, figures, tables};
 use crate::exit_status::CommandError;
@@ -15,7 +15,7 @@ pub const PAGE: &str = "validation.html";
 pub fn files(validation: &Validation) -> Result<Vec<PageFile>, CommandError> {
     let (parts, tables) = (figures::all(validation), tables::all(validation));
     let title = format!("Validation of the extrapolation grade: {}", validation.elements.join(", "));
-    let text = page::write(&title, &lead(validation), sections(&parts, &tables));
+    let text = page::write(&title, &lead(validation), sections(&validation.labelled, &parts, &tables));
     let json = serde_json::to_vec_pretty(validation).map_err(CommandError::failed)?;
     let mut files = vec![
         PageFile { path: PAGE.to_owned(), bytes: text.into_bytes() },
@@ -27,12 +27,16 @@ pub fn files(validation: &Validation) -> Result<Vec<PageFile>, CommandError> {
     Ok(files)
 }
 
-fn sections<'a>(parts: &'a [page::FigureEntry], tables: &'a [page::PageTable]) -> Vec<Section<'a>> {
+fn sections<'a>(
+    sets: &[LabelledSet],
+    parts: &'a [page::FigureEntry],
+    tables: &'a [page::PageTable],
+) -> Vec<Section<'a>> {
     let figure = |name: &str| PageBlock::figure(parts, name);
     let table = |name: &str| PageBlock::table(tables, name);
     let blocks = |blocks: Vec<Option<PageBlock<'a>>>| blocks.into_iter().flatten().collect::<Vec<_>>();
     let words = |words: &str| Some(PageBlock::Paragraph(words.into()));
-    vec![
+    let mut sections: Vec<Section<'a>> = vec![
         (
             "Compression and stretching",
             blocks(vec![
@@ -58,7 +62,7 @@ fn sections<'a>(parts: &'a [page::FigureEntry], tables: &'a [page::PageTable]) -
                 table("defects"),
             ]),
         ),
-        ("Composition", blocks(vec![figure("solutions"), table("solutions")])),
+        ("Composition", blocks(vec![figure("solutions"), table("solutions"), table("training-data")])),
         (
             "Feature space",
             blocks(vec![
@@ -82,41 +86,71 @@ fn sections<'a>(parts: &'a [page::FigureEntry], tables: &'a [page::PageTable]) -
                      such a pair apart. A search that ends far away proves nothing. The file collisions.extxyz has the pairs.",
                 )),
                 table("collision-search"),
-            ]),
-        ),
-        (
-            "Labelled structures",
-            blocks(vec![
-                table("label-errors").and(words(
-                    "A grade should rank the force errors of atoms, and few of the atoms within its limit should have large ones. Intervals are \
-                     too narrow for few structures, and for frames of one trajectory.",
+                table("feature-ranks").and(words(
+                    "One atom’s features have fewer numbers than its environment has directions, so that some directions change none of them. The \
+                     features of all atoms together should leave no direction but translations and rotations: their rank should be 3N − 6.",
                 )),
-                table("label-errors"),
-                figure("reliability"),
-                figure("error-histograms"),
-                figure("score-distributions"),
-                table("ranks"),
-                figure("contamination"),
-                table("confident"),
-                figure("auc-sweep"),
-                table("auc-thresholds"),
-                table("worst-deciles"),
-                table("quantiles"),
-                table("element-errors"),
-                figure("composition-errors"),
-                table("composition-errors"),
-                figure("mixture-contamination"),
-                figure("mixture-map"),
-                table("mixtures"),
+                table("feature-ranks"),
             ]),
         ),
-    ]
+    ];
+    if sets.len() > 1 {
+        let blocks = [table("labelled-sets"), figure("error-grid")];
+        sections.push(("Sets of labelled structures", blocks.into_iter().flatten().collect()));
+    } else {
+        let blocks = figure("error-grid").into_iter().collect();
+        sections.push(("Models on the labelled structures", blocks));
+    }
+    sections.extend(sets.iter().enumerate().map(|(number, set)| labelled_set(parts, tables, (number, set))));
+    sections
+}
+
+/// What a set of labelled structures says.
+fn labelled_set<'a>(
+    parts: &'a [page::FigureEntry],
+    tables: &'a [page::PageTable],
+    (number, set): (usize, &LabelledSet),
+) -> Section<'a> {
+    let figure = |name: &str| PageBlock::figure(parts, &of_set(name, number));
+    let table = |name: &str| PageBlock::table(tables, &of_set(name, number));
+    let words = format!(
+        "{}: a grade should rank the force errors of atoms, and few of the atoms within its limit should have large ones. Intervals are too \
+         narrow for few structures, and for frames of one trajectory.",
+        set.file
+    );
+    let blocks = [
+        table("label-errors").and(Some(PageBlock::Paragraph(words))),
+        table("label-errors"),
+        figure("reliability"),
+        figure("error-histograms"),
+        figure("score-distributions"),
+        table("ranks"),
+        figure("contamination"),
+        table("confident"),
+        figure("auc-sweep"),
+        table("auc-thresholds"),
+        table("worst-deciles"),
+        table("quantiles"),
+        table("element-errors"),
+        figure("composition-errors"),
+        table("composition-errors"),
+        figure("mixture-contamination"),
+        figure("mixture-map"),
+        table("mixtures"),
+    ];
+    let heading = if number == 0 { "Labelled structures" } else { "Further labelled structures" };
+    (heading, blocks.into_iter().flatten().collect())
+}
+
+/// The name of a figure or a table of a set of labelled structures, from 0.
+pub fn of_set(name: &str, number: usize) -> String {
+    if number == 0 { name.to_owned() } else { format!("{name}-{}", number + 1) }
 }
 
 fn lead(validation: &Validation) -> String {
     let gamma = &validation.scores[0];
     let tested = validation.bond_scans.iter().filter(|scan| scan.is_ground_state).count();
-    let labelled = validation.labelled.as_ref().map_or(String::new(), ranking);
+    let labelled: String = validation.labelled.iter().map(ranking).collect();
     format!(
         "Tests without labels, of a model with a cutoff of {} Å. In the bond scans of {tested} of {}, γ detects \
          compression/stretching: {}.{labelled}",
@@ -127,7 +161,7 @@ fn lead(validation: &Validation) -> String {
 }
 
 /// How well the first score, γ, ranks the force errors of labelled structures.
-fn ranking(report: &LabelledReport) -> String {
+fn ranking(LabelledSet { report, .. }: &LabelledSet) -> String {
     let structures = crate::output::count(report.structures, "labelled structure");
     let rho = report.scores.first().and_then(|score| score.spearman.value);
     rho.map_or(format!(" {structures} without an order of force errors."), |rho| {

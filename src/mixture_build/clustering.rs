@@ -31,7 +31,7 @@ impl MixtureBuild {
             return Ok(Some(partition));
         }
         let Some(found) = self.cluster()? else { return Ok(None) };
-        let partition = found.combine(&self.settings, self.context.model.elements().len())?;
+        let partition = found.combine(&self.settings, self.context.model.model.elements().len())?;
         self.state.save_partition(&partition)?;
         Ok(Some(partition))
     }
@@ -46,7 +46,7 @@ impl MixtureBuild {
             hashes.lock().unwrap_or_else(PoisonError::into_inner).insert(shard.index, shard.hash);
             Ok(finished.contains(&(shard.index, shard.hash)))
         };
-        let elements = context.model.elements().len();
+        let elements = context.model.model.elements().len();
         let begin = |shard| {
             (0..elements).map(|element| ShardClustering::new(settings, shard, element).map(Some)).collect()
         };

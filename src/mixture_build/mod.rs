@@ -86,7 +86,8 @@ impl MixtureBuild {
         let Some(components) = self.components(&partition)? else { return Ok(None) };
         let Some(histograms) = self.histograms(&partition, &components)? else { return Ok(None) };
         let settings = self.settings.clone();
-        mixture(&self.context.model, projection, projection_seed, settings, components, histograms).map(Some)
+        mixture(&self.context.model.model, projection, projection_seed, settings, components, histograms)
+            .map(Some)
     }
 
     /// Takes the part through one pass, from 1 to 3. Returns whether it came to the end; otherwise it was stopped, and the same

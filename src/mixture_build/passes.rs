@@ -2,12 +2,12 @@
 
 use calm::build::{BuildError, CalibrationPass, ElementHistograms, ElementSums, ScatterPass, shuffled};
 use calm::build::{ShardClustering, ShardClusters};
-use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
 use super::feature_cache::{FeatureReader, FeatureWriter};
 use super::stream::{Shard, ShardHash, TrainingStructure};
 use crate::exit_status::CommandError;
+use crate::feature_variant::FeatureModel;
 use crate::features::FeatureCalculator;
 
 /// Atoms of an element that are passed on together: they stay in the cache.
@@ -95,7 +95,7 @@ pub enum FeatureSource<'a> {
     /// They are computed, and written for later passes.
     Computed { calculator: &'a mut FeatureCalculator, writer: Option<FeatureWriter<'a>> },
     /// They are those of an earlier pass.
-    Stored { reader: FeatureReader, model: &'a GraceModel },
+    Stored { reader: FeatureReader, model: &'a FeatureModel },
 }
 
 impl FeatureSource<'_> {
@@ -105,16 +105,16 @@ impl FeatureSource<'_> {
             Self::Computed { calculator, writer } => {
                 let elements = calculator.compute(&training.structure);
                 let elements = elements.map_err(|error| training.position.wrong(error))?;
-                let features = calculator.grace.features();
+                let features = calculator.features();
                 if let Some(writer) = writer {
                     writer.add(features);
                 }
                 Ok(Some((elements, features)))
             }
             Self::Stored { reader, model } => {
-                let elements = model.element_indices(&training.structure.species);
+                let elements = model.model.element_indices(&training.structure.species);
                 let elements = elements.map_err(|error| training.position.wrong(error))?;
-                let features = reader.next(elements.len() * model.feature_dimension());
+                let features = reader.next(elements.len() * model.dimension());
                 Ok(features.map(|features| (elements, features)))
             }
         }

@@ -1,7 +1,6 @@
 //! The features of a mixture: the model with its projection.
 
 use std::path::Path;
-use std::sync::Arc;
 
 use calm::Projection;
 use calm::build::random_projection;
@@ -14,7 +13,7 @@ use crate::feature_variant::{FeatureModel, FeatureVariant, with_projection};
 /// Projected features of a model without a projection, as in the paper.
 pub const PROJECTED: usize = 128;
 
-/// The model with the features of `variant`, their projection, and the random seed of that if it is known. A model without a
+/// The model with the features of `variant`, the projection that an artifact of them stores, and the random seed of that if it is known. A model without a
 /// projection gets a random one with `dimension` projected features.
 pub fn projected(
     path: &Path,
@@ -22,8 +21,11 @@ pub fn projected(
     variant: Option<FeatureVariant>,
     seed: u64,
     dimension: usize,
-) -> Result<(Arc<GraceModel>, Projection, Option<i64>), CommandError> {
-    let seed = if model.projection().is_some() {
+) -> Result<(FeatureModel, Projection, Option<i64>), CommandError> {
+    let needs_projection = variant != Some(FeatureVariant::Hidden);
+    let seed = if !needs_projection {
+        None
+    } else if model.projection().is_some() {
         let file = NpzFile::open(path).map_err(CommandError::input)?;
         let key = "uq_rp_seed";
         let seed = file.contains(key).then(|| file.integers(key)).transpose().map_err(CommandError::input)?;
@@ -36,11 +38,8 @@ pub fn projected(
         i64::try_from(seed).ok()
     };
     let found = FeatureModel::new(path, model, variant)?;
-    let Some(projection) = found.projection() else {
-        return Err(CommandError::Input(
-            "--feature-variant hidden: a mixture needs projected features; expected normalised or linear"
-                .into(),
-        ));
-    };
-    Ok((found.model, projection, seed))
+    let projection = found.stored_projection().ok_or_else(|| {
+        CommandError::Failed(format!("{}: the model has no projection of its features", path.display()))
+    })?;
+    Ok((found, projection, seed))
 }

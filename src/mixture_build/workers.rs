@@ -8,7 +8,6 @@ use std::thread;
 use std::time::Duration;
 
 use calm::build::BuildError;
-use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
 use super::feature_cache::FeatureCache;
@@ -16,6 +15,7 @@ use super::part::BuildPart;
 use super::passes::{ElementPass, FeatureSource, ShardResult, run_shard};
 use super::stream::{Shard, ShardReader};
 use crate::exit_status::CommandError;
+use crate::feature_variant::FeatureModel;
 use crate::features::FeatureCalculator;
 use crate::structure_files::StructureFiles;
 
@@ -24,7 +24,8 @@ const PROGRESS_INTERVAL: Duration = Duration::from_millis(200);
 
 /// What all passes share.
 pub struct PassContext {
-    pub model: Arc<GraceModel>,
+    /// With the features of the mixture.
+    pub model: FeatureModel,
     pub files: StructureFiles,
     pub shard_size: u64,
     /// The part of this process; `None` if it makes the whole build.
@@ -137,7 +138,7 @@ impl<F, B> Shared<'_, F, B> {
         F: Fn(&Shard) -> Result<bool, CommandError>,
         B: Fn(u64) -> Result<Vec<Option<P>>, BuildError>,
     {
-        let mut calculator = FeatureCalculator::new(Arc::clone(&self.context.model));
+        let mut calculator = self.context.model.calculator();
         let context = self.context;
         while !context.stop.is_cancelled() {
             let shard = {

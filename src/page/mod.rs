@@ -5,6 +5,7 @@ mod html;
 pub mod style;
 mod table;
 
+use std::borrow::Cow;
 use std::fs;
 use std::io::Write;
 use std::path::Path;
@@ -23,7 +24,7 @@ const RESOLUTION: f64 = 300.0;
 /// A figure of the page, or the reason why it is missing.
 pub struct FigureEntry {
     /// Name of its files.
-    pub name: &'static str,
+    pub name: Cow<'static, str>,
     /// Its title.
     pub title: &'static str,
     /// The figure, or why it is missing.

@@ -1,5 +1,7 @@
 //! Tables, rounded for the page and with full precision for a file.
 
+use std::borrow::Cow;
+
 use crate::csv::{self, Csv};
 
 /// Largest number of rows on the page, for tables that grow with the campaign.
@@ -8,7 +10,7 @@ const MAX_PAGE_ROWS: usize = 60;
 /// A table.
 pub struct PageTable {
     /// Name of its file and its anchor on the page.
-    pub name: &'static str,
+    pub name: Cow<'static, str>,
     /// Caption. Supports `_{…}` and `^{…}`, as the titles do.
     pub caption: String,
     /// Column titles.
@@ -34,7 +36,7 @@ impl PageTable {
     /// A table without rows.
     pub fn new(name: &'static str, caption: &str, titles: &[&'static str]) -> Self {
         Self {
-            name,
+            name: name.into(),
             caption: caption.into(),
             titles: titles.to_vec(),
             rows: Vec::new(),

@@ -2,7 +2,6 @@
 
 use std::collections::HashSet;
 use std::path::Path;
-use std::sync::Arc;
 
 use calm::build::{ArtifactVersion, BuildSettings};
 use calm::{Artifact, Projection};
@@ -15,7 +14,7 @@ use super::native::files;
 use super::settings::RefitterConfig;
 use crate::artifact_checks::check_sound;
 use crate::exit_status::CommandError;
-use crate::feature_variant::with_projection;
+use crate::feature_variant::{FeatureModel, with_projection};
 use crate::file_hash;
 use crate::mixture_build::{MixtureBuild, PROJECTED, PassContext, projected};
 use crate::mixture_files::{MixtureFiles, write_beside};
@@ -51,7 +50,7 @@ pub async fn build(
     let mut data = files(&config.settings, labels)?;
     data.files.iter_mut().for_each(|file| file.weight = 1.0);
     let context = PassContext {
-        model: Arc::clone(&found),
+        model: found.clone(),
         files: data,
         shard_size: SHARD_SIZE,
         part: None,
@@ -72,7 +71,8 @@ pub async fn build(
     let original = Artifact::load(&artifact).map_err(CommandError::failed)?;
     check_sound(&original, output).map_err(RefitFailure::Refused)?;
     let updated =
-        unlabelled_updates::apply_others(store, &found, original.mixture.clone(), trained_on, stop).await?;
+        unlabelled_updates::apply_others(store, &found.model, original.mixture.clone(), trained_on, stop)
+            .await?;
     let Some(updated) = updated else { return Ok(None) };
     let version =
         ArtifactVersion::new(&artifact, &original.mixture, &updated.mixture).map_err(CommandError::failed)?;
@@ -89,7 +89,7 @@ pub async fn build(
 fn model(
     config: &RefitterConfig,
     path: &Path,
-) -> Result<(Arc<GraceModel>, Projection, Option<i64>), RefitFailure> {
+) -> Result<(FeatureModel, Projection, Option<i64>), RefitFailure> {
     let mut model = GraceModel::load(path).map_err(RefitFailure::refused)?;
     let is_its_own = model.projection().is_some();
     if !is_its_own {

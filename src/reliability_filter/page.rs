@@ -13,8 +13,12 @@ pub const PAGE: &str = "filter.html";
 /// All files, the page first. `grade` is the title of the grade's column.
 pub fn files(report: &FilterReport, rows: &[GradedRow], grade: &str) -> Result<Vec<PageFile>, CommandError> {
     let parts = vec![
-        FigureEntry { name: "errors", title: "Errors and grades", drawn: errors::draw(rows, grade) },
-        FigureEntry { name: "filter", title: "What a threshold keeps", drawn: Ok(sweep(report, grade)) },
+        FigureEntry { name: "errors".into(), title: "Errors and grades", drawn: errors::draw(rows, grade) },
+        FigureEntry {
+            name: "filter".into(),
+            title: "What a threshold keeps",
+            drawn: Ok(sweep(report, grade)),
+        },
     ];
     let tables = [thresholds(report)];
     let figure = |name| PageBlock::figure(&parts, name);

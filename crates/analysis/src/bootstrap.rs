@@ -124,7 +124,8 @@ mod tests {
 
     #[test]
     fn intervals_are_those_of_each_statistic() {
-        let values = |draw: u32| vec![Some(f64::from(draw)), draw.is_multiple_of(4).then_some(1.0), Some(7.0)];
+        let values =
+            |draw: u32| vec![Some(f64::from(draw)), draw.is_multiple_of(4).then_some(1.0), Some(7.0)];
         let first: Vec<_> = (0..NINETY.draws).map(|draw| Some(f64::from(draw))).collect();
         let expected = [NINETY.interval(&first), None, Some((7.0, 7.0))];
         assert_eq!(NINETY.intervals(values), expected);

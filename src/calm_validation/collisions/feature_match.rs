@@ -4,6 +4,7 @@ use atoms::cell::{norm, sub};
 use atoms::{Cell, Species, Structure, Vec3};
 use potentials::grace::PullBack;
 
+use super::ranks::combined_rows;
 use crate::features::FeatureCalculator;
 
 /// Distances that neighbours keep, Å.
@@ -41,7 +42,24 @@ impl<'a> FeatureMatch<'a> {
 
     /// |z − z_A| / |z_A| of an atom with these neighbours. `None` if it has no features.
     pub fn distance(&mut self, neighbours: &[Vec3]) -> Option<f64> {
-        self.deviations(neighbours).map(|deviations| (square(&deviations) / square(&self.target)).sqrt())
+        self.deviations(neighbours).map(|deviations| self.relative(&deviations))
+    }
+
+    /// |z − z_A| / |z_A|
+    pub fn relative(&self, deviations: &[f64]) -> f64 {
+        (square(deviations) / square(&self.target)).sqrt()
+    }
+
+    /// D
+    pub fn dimension(&self) -> usize {
+        self.target.len()
+    }
+
+    /// Gradients of combinations of the features of the last environment by the coordinates of its m neighbours, `[weights × 3m]`, 1/Å.
+    pub fn combined_rows(&mut self, weights: &[Vec<f64>]) -> Vec<f64> {
+        let columns = 3 * self.calculator.features().len() / self.target.len();
+        let rows = combined_rows(self.calculator, weights);
+        rows.chunks_exact(columns).flat_map(|row| &row[3..]).copied().collect()
     }
 
     /// The function for the coordinates of the neighbours, `[3m]`, Å; writes its gradient, 1/Å. `None` without features.
@@ -57,8 +75,8 @@ impl<'a> FeatureMatch<'a> {
         Some(square(&deviations) / size + self.allowed.penalty(neighbours, of_neighbours))
     }
 
-    /// z − z_A
-    fn deviations(&mut self, neighbours: &[Vec3]) -> Option<Vec<f64>> {
+    /// z − z_A of an atom with these neighbours. `None` if it has no features.
+    pub fn deviations(&mut self, neighbours: &[Vec3]) -> Option<Vec<f64>> {
         self.calculator.compute(&cluster(self.species, neighbours)).ok()?;
         let found = self.calculator.features().iter();
         Some(self.target.iter().zip(found).map(|(target, found)| found - target).collect())
@@ -67,7 +85,7 @@ impl<'a> FeatureMatch<'a> {
 
 impl AllowedDistances {
     /// Σ (1 − r / closest)² over distances that are too short and Σ (r / farthest − 1)² over those that are too long; adds the gradient.
-    fn penalty(self, neighbours: &[Vec3], gradient: &mut [Vec3]) -> f64 {
+    pub fn penalty(self, neighbours: &[Vec3], gradient: &mut [Vec3]) -> f64 {
         let mut sum = 0.0;
         for (i, a) in neighbours.iter().enumerate() {
             let r = norm(*a);

@@ -3,7 +3,9 @@
 mod environments;
 mod feature_match;
 mod lbfgs;
+mod null_space;
 pub mod octagon;
+pub mod ranks;
 pub mod search;
 #[cfg(test)]
 mod tests;

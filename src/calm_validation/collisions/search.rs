@@ -10,13 +10,14 @@ use serde::Serialize;
 use super::environments::{EnvironmentDifference, random_neighbours};
 use super::feature_match::{AllowedDistances, FeatureMatch, cluster};
 use super::lbfgs::Lbfgs;
+use super::null_space::NullSpaceWalk;
 use crate::all_cores;
 use crate::calm_validation::random::RandomSequence;
 use crate::calm_validation::{Subject, ValidationGrader, ValidationProgress, ValidationSettings};
 use crate::features::FeatureCalculator;
 
 /// Neighbours of an environment (paper).
-const NEIGHBOURS: usize = 50;
+pub const NEIGHBOURS: usize = 50;
 /// Elements for which pairs are searched; the paper takes one.
 const MAX_ELEMENTS: usize = 6;
 /// Minimisations of which the best is kept. The paper gives no number.
@@ -25,6 +26,10 @@ const STARTS: usize = 2;
 const DISPLACEMENT: f64 = 0.3;
 /// Relative distance of the features at which a search ends: that of the paper's pairs.
 const TARGET: f64 = 1e-9;
+/// A walk in the null space ends at this root mean square distance, Å (paper).
+const WALKED: f64 = 1.0;
+/// Such a walk lets distances fall to this share of the shortest one at its start: otherwise there is no room for it.
+const WALK_ROOM: f64 = 0.8;
 /// Largest change of a coordinate in a step, Å.
 const REACH: f64 = 0.2;
 /// Random neighbours are so far from the middle at most, in cutoffs …
@@ -94,6 +99,8 @@ pub enum SearchStart {
     Unrelated,
     /// At the first environment with displaced neighbours.
     DisplacedCopy,
+    /// At the first environment; it moves along directions in which no feature changes.
+    NullSpace,
 }
 
 impl MatchedFeatures {
@@ -112,25 +119,31 @@ impl SearchStart {
         match self {
             Self::Unrelated => "unrelated",
             Self::DisplacedCopy => "displaced copy of A",
+            Self::NullSpace => "A, walk in the null space",
         }
     }
 }
 
 /// What is searched for each element: features, start, and whether there are so few neighbours that the densities of the readout can tell
 /// all environments apart.
-const SEARCHES: [(MatchedFeatures, SearchStart, bool); 5] = [
+const SEARCHES: [(MatchedFeatures, SearchStart, bool); 6] = [
     (MatchedFeatures::HiddenLayer, SearchStart::Unrelated, false),
     (MatchedFeatures::HiddenLayer, SearchStart::DisplacedCopy, false),
     (MatchedFeatures::HiddenLayer, SearchStart::Unrelated, true),
     (MatchedFeatures::Graded, SearchStart::Unrelated, false),
     (MatchedFeatures::Graded, SearchStart::DisplacedCopy, false),
+    (MatchedFeatures::HiddenLayer, SearchStart::NullSpace, false),
 ];
+
+/// The elements whose environments are searched; none without evaluations.
+pub fn searched(settings: &ValidationSettings) -> impl Iterator<Item = Species> {
+    let is_wanted = settings.collision_evaluations > 0;
+    settings.elements.iter().take(MAX_ELEMENTS).filter(move |_| is_wanted).copied()
+}
 
 /// Elements and numbers of their searches.
 fn tasks(settings: &ValidationSettings) -> Vec<(Species, usize)> {
-    let elements = settings.elements.iter().take(MAX_ELEMENTS);
-    let tasks = elements.flat_map(|species| (0..SEARCHES.len()).map(move |search| (*species, search)));
-    tasks.filter(|_| settings.collision_evaluations > 0).collect()
+    searched(settings).flat_map(|species| (0..SEARCHES.len()).map(move |search| (species, search))).collect()
 }
 
 /// Number of searches.
@@ -164,7 +177,7 @@ pub fn run(
 }
 
 /// Where neighbours may be. `None` for an element that the model does not know.
-fn allowed(model: &GraceModel, species: Species, equilibrium: f64) -> Option<AllowedDistances> {
+pub fn allowed(model: &GraceModel, species: Species, equilibrium: f64) -> Option<AllowedDistances> {
     let element = *model.element_indices(&[species]).ok()?.first()?;
     let cutoff = model.pair_cutoff(element, element);
     let closest = (CLOSEST * equilibrium).min(ROOM * RADIUS * cutoff);
@@ -180,12 +193,15 @@ fn few_neighbours(densities: usize) -> usize {
 struct PairSearch {
     grader: ValidationGrader,
     hidden: FeatureCalculator,
+    /// Densities of the readout, of which the hidden layer is a function.
+    densities: usize,
 }
 
 impl PairSearch {
     fn new(subject: &Subject) -> Self {
         let hidden = FeatureCalculator::of_hidden_layer(subject.model.clone());
-        Self { grader: ValidationGrader::new(subject), hidden }
+        let densities = subject.model.density_dimension();
+        Self { grader: ValidationGrader::new(subject), hidden, densities }
     }
 
     /// One minimisation. `None` if it was stopped, or if environments have no room or no grades.
@@ -200,9 +216,11 @@ impl PairSearch {
             return None;
         }
         let (features, kind, is_control) = SEARCHES[search];
-        let few = few_neighbours(self.hidden.grace.model().density_dimension());
+        let few = few_neighbours(self.densities);
         let number = if is_control { few } else { NEIGHBOURS };
-        let [first, second] = begin(settings.seed, (species, allowed), (search, start), number)?;
+        let mut random = sequence(settings.seed, species, 1 + search * STARTS + start);
+        let first = first_environment(settings.seed, (species, allowed), number)?;
+        let second = second_environment(kind, &first, allowed, &mut random)?;
         let calculator = match features {
             MatchedFeatures::HiddenLayer => &mut self.hidden,
             MatchedFeatures::Graded => &mut self.grader.features,
@@ -210,10 +228,19 @@ impl PairSearch {
         let mut matched = FeatureMatch::new(calculator, species, allowed, &first)?;
         let start_distance = matched.distance(&second)?;
         let max_evaluations = settings.collision_evaluations;
-        let limits = Lbfgs { target: TARGET * TARGET, max_evaluations, reach: REACH };
         let stop = || progress.is_stopped();
-        let lowest = limits.minimise(second.concat(), |x, gradient| matched.evaluate(x, gradient), stop)?;
-        let second: Vec<Vec3> = lowest.point.as_chunks().0.to_vec();
+        let (point, evaluations) = if kind == SearchStart::NullSpace {
+            let allowed = AllowedDistances { closest: WALK_ROOM * allowed.closest, ..allowed };
+            let (max_rank, target) = (self.densities, TARGET);
+            let walk = NullSpaceWalk { target, farthest: WALKED, max_evaluations, allowed, max_rank };
+            walk.run(&mut matched, &first, &mut random, stop)?
+        } else {
+            let limits = Lbfgs { target: TARGET * TARGET, max_evaluations, reach: REACH };
+            let f = |x: &[f64], gradient: &mut [f64]| matched.evaluate(x, gradient);
+            let lowest = limits.minimise(second.concat(), f, stop)?;
+            (lowest.point, lowest.evaluations)
+        };
+        let second: Vec<Vec3> = point.as_chunks().0.to_vec();
         let distance = matched.distance(&second)?;
         let difference = EnvironmentDifference::new(&first, &second);
         let structures = [cluster(species, &first), cluster(species, &second)];
@@ -232,7 +259,7 @@ impl PairSearch {
             energies: [a.energy, b.energy],
             forces: [a.force, b.force],
             scores: [a.scores, b.scores],
-            evaluations: lowest.evaluations,
+            evaluations,
             structures,
         })
     }
@@ -251,27 +278,38 @@ impl PairSearch {
     }
 }
 
-/// The environments of a search at its start: the same first one in all searches of an element with this number of neighbours. `None`
-/// without room.
-fn begin(
+/// The sequence of random numbers of an element with this number.
+fn sequence(seed: u64, species: Species, role: usize) -> RandomSequence {
+    let number = usize::from(species.atomic_number()) * (1 + SEARCHES.len() * STARTS) + role;
+    RandomSequence::new(seed, SEQUENCES + number as u64)
+}
+
+/// The first environment of all searches of an element with this number of neighbours. `None` without room.
+pub fn first_environment(
     seed: u64,
     (species, allowed): (Species, AllowedDistances),
-    (search, start): (usize, usize),
     number: usize,
-) -> Option<[Vec<Vec3>; 2]> {
-    let random = |role: usize| {
-        let sequence = usize::from(species.atomic_number()) * (1 + SEARCHES.len() * STARTS) + role;
-        RandomSequence::new(seed, SEQUENCES + sequence as u64)
-    };
-    let radius = RADIUS / FARTHEST * allowed.farthest;
-    let place = |random: &mut RandomSequence| random_neighbours(number, radius, allowed.closest, random);
-    let first = place(&mut random(0))?;
-    let mut random = random(1 + search * STARTS + start);
-    let second = match SEARCHES[search].1 {
-        SearchStart::Unrelated => place(&mut random)?,
-        SearchStart::DisplacedCopy => first.iter().map(|r| displaced(*r, &mut random)).collect(),
-    };
-    Some([first, second])
+) -> Option<Vec<Vec3>> {
+    place(number, allowed, &mut sequence(seed, species, 0))
+}
+
+/// Where the second environment begins. `None` without room.
+fn second_environment(
+    start: SearchStart,
+    first: &[Vec3],
+    allowed: AllowedDistances,
+    random: &mut RandomSequence,
+) -> Option<Vec<Vec3>> {
+    match start {
+        SearchStart::Unrelated => place(first.len(), allowed, random),
+        SearchStart::DisplacedCopy => Some(first.iter().map(|r| displaced(*r, random)).collect()),
+        SearchStart::NullSpace => Some(first.to_vec()),
+    }
+}
+
+/// Random neighbours.
+fn place(number: usize, allowed: AllowedDistances, random: &mut RandomSequence) -> Option<Vec<Vec3>> {
+    random_neighbours(number, RADIUS / FARTHEST * allowed.farthest, allowed.closest, random)
 }
 
 /// What an atom has in an environment.

@@ -10,6 +10,7 @@ use potentials::grace::GraceModel;
 use super::environments::{EnvironmentDifference, random_neighbours};
 use super::feature_match::{AllowedDistances, FeatureMatch};
 use super::lbfgs::Lbfgs;
+use super::null_space::NullSpaceWalk;
 use crate::calm_validation::random::RandomSequence;
 use crate::features::FeatureCalculator;
 
@@ -114,4 +115,25 @@ fn another_environment_with_the_hidden_layer_of_the_first_is_found() {
     assert!(after < 1e-2 * before, "{before} {after}");
     let difference = EnvironmentDifference::new(&first, &found);
     assert!(difference.excludes_symmetry(1e-3), "{difference:?}");
+}
+
+/// Seven neighbours have 18 directions without rotations; nine densities can change along nine of them at most.
+#[test]
+fn a_walk_in_the_null_space_keeps_the_hidden_layer() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/data/al_eam_1l/kokkos.npz");
+    let model = Arc::new(GraceModel::load(&path).unwrap());
+    let (species, max_rank) = (model.elements()[0], model.density_dimension());
+    assert_eq!(max_rank, 9);
+    let allowed = AllowedDistances { closest: 1.5, farthest: 5.5 };
+    let first = random_neighbours(7, 4.0, 2.2, &mut RandomSequence::new(1, 2)).unwrap();
+    let mut calculator = FeatureCalculator::of_hidden_layer(model);
+    let mut matched = FeatureMatch::new(&mut calculator, species, allowed, &first).unwrap();
+    let walk = NullSpaceWalk { target: 1e-9, farthest: 0.3, max_evaluations: 500, allowed, max_rank };
+    let found = walk.run(&mut matched, &first, &mut RandomSequence::new(1, 3), || false);
+    let (point, evaluations) = found.unwrap();
+    let found: Vec<Vec3> = point.as_chunks().0.to_vec();
+    assert!(evaluations <= 500 && matched.distance(&found).unwrap() <= 1e-9);
+    let difference = EnvironmentDifference::new(&first, &found);
+    assert!(difference.superposed > 0.03 && difference.excludes_symmetry(1e-3), "{difference:?}");
+    assert_eq!(allowed.penalty(&found, &mut vec![[0.0; 3]; found.len()]), 0.0);
 }

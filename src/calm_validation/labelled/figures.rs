@@ -3,6 +3,7 @@
 mod compositions;
 mod curves;
 mod distributions;
+mod error_grid;
 mod error_histograms;
 mod mixture_curves;
 mod mixture_map;
@@ -10,14 +11,15 @@ mod reliability;
 
 use ::figures::{Colour, Point, Stroke};
 
+pub use self::error_grid::draw as error_grid;
 pub use self::mixture_curves::draw as mixtures;
 pub use self::mixture_map::draw as mixture_map;
 
-use super::report::{ErrorHistograms, IntervalEstimate, LabelledReport};
+use super::report::{ErrorHistograms, IntervalEstimate, LabelledReport, TrainingErrors};
 use crate::page::FigureEntry;
 
-/// The figures, none without force labels.
-pub fn all(report: &LabelledReport) -> Vec<FigureEntry> {
+/// The figures, none without force labels; with the errors on training data, where both are comparable.
+pub fn all(report: &LabelledReport, training: Option<TrainingErrors>) -> Vec<FigureEntry> {
     if report.atoms == 0 {
         return Vec::new();
     }
@@ -29,7 +31,7 @@ pub fn all(report: &LabelledReport) -> Vec<FigureEntry> {
         figures.push(curves::contamination(report));
     }
     figures.push(curves::areas(report));
-    figures.extend(compositions::draw(report));
+    figures.extend(compositions::draw(report, training));
     figures
 }
 

@@ -217,6 +217,27 @@ pub struct ScoreMean {
     pub beyond: Option<f64>,
 }
 
+/// Mean absolute errors on the training data, with which others are compared.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct TrainingErrors {
+    /// Energy per atom without the offsets of elements, eV.
+    pub energy: Option<f64>,
+    /// |F_model − F_label|, eV/Å.
+    pub force: Option<f64>,
+}
+
+impl From<&LabelledReport> for TrainingErrors {
+    fn from(report: &LabelledReport) -> Self {
+        let (sum, atoms) = report.elements.iter().fold((0.0, 0), |(sum, atoms), element| {
+            (sum + element.atoms as f64 * element.forces.mean, atoms + element.atoms)
+        });
+        Self {
+            energy: report.energy_without_offsets.mean_absolute.value,
+            force: (atoms > 0).then(|| sum / atoms as f64),
+        }
+    }
+}
+
 impl LabelledReport {
     /// The index of a threshold.
     pub fn threshold(&self, threshold: f64) -> Option<usize> {

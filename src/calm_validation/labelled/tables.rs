@@ -190,7 +190,7 @@ fn intervals(report: &LabelledReport) -> String {
 }
 
 /// The name of a score without markup, which cells do not support.
-fn name(score: &ScoreReport) -> TableCell {
+pub(super) fn name(score: &ScoreReport) -> TableCell {
     text(::figures::plain(&score.name))
 }
 

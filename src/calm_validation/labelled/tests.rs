@@ -320,7 +320,7 @@ fn what_has_no_labels_says_nothing() {
     samples.iter_mut().for_each(|sample| sample.labels = FrameLabels::default());
     let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
     assert_eq!((report.structures, report.atoms), (0, 0));
-    assert!(tables(&report).is_empty() && figures(&report).is_empty());
+    assert!(tables(&report).is_empty() && figures(&report, None).is_empty());
     assert_eq!(report.scores[0].spearman.value, None);
     assert!(serde_json::to_string(&report).unwrap().contains("\"structures\":0"));
 }
@@ -331,8 +331,8 @@ fn figures_and_tables_show_every_score() {
     for number in [1, 60] {
         let samples: Vec<_> = (0..number).map(sample).collect();
         let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
-        let figures = figures(&report);
-        let names: Vec<_> = figures.iter().map(|figure| figure.name).collect();
+        let figures = figures(&report, None);
+        let names: Vec<_> = figures.iter().map(|figure| figure.name.clone()).collect();
         let all = [
             "reliability",
             "error-histograms",
@@ -361,7 +361,8 @@ fn figures_and_tables_show_every_score() {
         for words in ["labelled structure", "d_nn", "γ ≤ 1", "> 5", "stress components"] {
             assert!(text.contains(words), "{text}");
         }
-        let rows: Vec<_> = tables(&report).iter().map(|table| (table.name, table.rows.len())).collect();
+        let tables = tables(&report);
+        let rows: Vec<_> = tables.iter().map(|table| (&*table.name, table.rows.len())).collect();
         // A single structure has no energy offsets, and this one has one element.
         let expected: &[_] = match number {
             1 => &[

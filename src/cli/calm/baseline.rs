@@ -154,10 +154,7 @@ impl CalmBaselineArgs {
                 FeatureModel::for_artifact(&self.model, model, &artifact.projection)?
             }
         };
-        let Some(projection) = features.projection() else {
-            let message = "no artifact has the features of the hidden layer; leave --artifact out";
-            return Err(CommandError::Input(format!("{}: {message}", path.display())));
-        };
+        let projection = features.stored_projection().unwrap_or_else(|| artifact.projection.clone());
         artifact
             .check_belongs_to(&features.symbols(), &projection)
             .map_err(|error| CommandError::Input(format!("{}: {error}", path.display())))?;

@@ -12,7 +12,7 @@ use super::campaign_updates::UpdateSource;
 use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
-use crate::feature_variant::FeatureVariant;
+use crate::feature_variant::{FeatureModel, FeatureVariant};
 use crate::file_hash;
 use crate::mixture_build::{BuildPart, MixtureBuild, PROJECTED, PassContext, projected};
 use crate::mixture_files::MixtureFiles;
@@ -45,8 +45,8 @@ pub struct CalmBuildArgs {
     /// Also write a copy of the model with the new mixture, for LAMMPS and calmwalk
     #[arg(long, value_name = "MODEL.npz", conflicts_with = "feature_variant")]
     embed: Option<PathBuf>,
-    /// Features of the mixture, with the projection matrix of the model file: normalised or linear [default: as the file says].
-    /// Mixtures of other features serve comparisons (`calm score`, `calm baseline`), not campaigns
+    /// Features of the mixture: normalised or linear, with the projection matrix of the model file, or hidden [default: as the file says].
+    /// Mixtures of other features serve comparisons (`calm score`, `calm baseline`, `calm validate --compare-artifact`), not campaigns
     #[arg(long, value_name = "VARIANT")]
     feature_variant: Option<FeatureVariant>,
     /// Weight of the atoms of a file of DATA, 0 or more [default: 1], times calmwalk_weight of a frame if it has that key; may be repeated
@@ -96,6 +96,10 @@ impl CalmBuildArgs {
         let files = self.files()?;
         let campaign = self.campaign.as_deref().map(UpdateSource::find).transpose()?;
         let (model, projection, seed) = self.projected_model()?;
+        if model.is_hidden() && campaign.is_some() {
+            let message = "--campaign: updates grade the features of the campaign; expected no --feature-variant hidden";
+            return Err(CommandError::Input(message.into()));
+        }
         let stop = stop_token()?;
         let mut build = self.open(files, &model, &projection, &stop)?;
         if let (Some(pass), Some(part)) = (self.pass, self.part) {
@@ -104,7 +108,7 @@ impl CalmBuildArgs {
         let Some(mixture) = build.run(projection, seed)? else { return Ok(stopped()) };
         let embed = self.embed.as_deref().map(|copy| (self.model.as_path(), copy));
         let files = MixtureFiles { embed, output: &self.output };
-        let Some(updates) = write_mixture(&mixture, files, &model, campaign.as_ref(), &stop)? else {
+        let Some(updates) = write_mixture(&mixture, files, &model.model, campaign.as_ref(), &stop)? else {
             return Ok(stopped());
         };
         build.finish()?;
@@ -125,7 +129,7 @@ impl CalmBuildArgs {
     }
 
     /// As [`projected`], with what the command line says about the projection.
-    fn projected_model(&self) -> Result<(Arc<GraceModel>, Projection, Option<i64>), CommandError> {
+    fn projected_model(&self) -> Result<(FeatureModel, Projection, Option<i64>), CommandError> {
         let model = GraceModel::load(&self.model).map_err(CommandError::input)?;
         if let (Some(found), Some(_)) = (model.projection(), self.projection_dimension) {
             return Err(CommandError::Input(format!(
@@ -142,7 +146,7 @@ impl CalmBuildArgs {
     fn open(
         &self,
         files: StructureFiles,
-        model: &Arc<GraceModel>,
+        model: &FeatureModel,
         projection: &Projection,
         stop: &CancellationToken,
     ) -> Result<MixtureBuild, CommandError> {
@@ -155,7 +159,7 @@ impl CalmBuildArgs {
         };
         let hash = file_hash::hash(&self.model).map_err(CommandError::input)?;
         let context = PassContext {
-            model: Arc::clone(model),
+            model: model.clone(),
             files,
             shard_size: self.shard_size,
             part: self.part,

@@ -51,19 +51,20 @@ impl CalmMergeArgs {
         let mut merge = PartsMerge::open(&self.output, &hash)?;
         let BuildSettings { seed, dimension, .. } = *merge.settings();
         let norms = match self.feature_variant {
-            Some(FeatureVariant::Linear) => 0,
+            Some(FeatureVariant::Linear | FeatureVariant::Hidden) => 0,
             _ => 1 + model.description().architecture.layers(),
         };
         let dimension = dimension.saturating_sub(norms);
         let (model, projection, seed) = projected(&self.model, model, self.feature_variant, seed, dimension)?;
-        match merge.run(&model, projection, seed)? {
+        match merge.run(&model.model, projection, seed)? {
             Merged::Pass(pass) => {
                 print(|out| writeln!(out, "pass {pass} of 3 is merged; continue with --pass {}", pass + 1))?;
             }
             Merged::Mixture(mixture) => {
                 let embed = self.embed.as_deref().map(|copy| (self.model.as_path(), copy));
                 let files = MixtureFiles { embed, output: &self.output };
-                let updates = write_mixture(&mixture, files, &model, campaign.as_ref(), &stop_token()?)?;
+                let updates =
+                    write_mixture(&mixture, files, &model.model, campaign.as_ref(), &stop_token()?)?;
                 let Some(updates) = updates else { return Ok(stopped()) };
                 merge.finish()?;
                 report(&mixture, &self.output, &updates)?;

@@ -52,6 +52,11 @@ pub enum OtherScoreError {
 }
 
 impl OtherScores {
+    /// No other score.
+    pub fn none() -> Self {
+        Self { files: Vec::new(), ensemble: Vec::new(), averages: Vec::new() }
+    }
+
     /// Reads files of baselines, which must belong to the model, and further models. `graded` has the features that γ grades.
     pub fn load(
         model: &Path,

@@ -92,11 +92,11 @@ impl CalmScoreArgs {
             let artifact = self.artifact.as_deref().map(|path| (path, "the artifact"));
             refuse_to_replace(output, inputs.into_iter().chain(artifact))?;
         }
-        let (model, artifact) = load(&self.model, self.artifact.as_deref())?;
+        let (model, artifact) = load_any(&self.model, self.artifact.as_deref())?;
         let others = OtherScores::load(&self.model, &model, &self.baseline, &self.ensemble)?;
         let mut others = others.with_averages(&self.gamma_nbr);
         let dimension = artifact.mixture.dimension();
-        let mut scorer = Scorer::new(model.model, Arc::new(artifact.mixture));
+        let mut scorer = Scorer::new(&model, Arc::new(artifact.mixture));
         let mut frames = XyzReader::open(&self.input).map_err(CommandError::input)?;
         let bar = Bar::new(frames.length, BAR);
         let mut output = AtomicFile::create(&self.output)?;
@@ -152,6 +152,22 @@ pub(in crate::cli) fn load(
     export: &Path,
     artifact: Option<&Path>,
 ) -> Result<(FeatureModel, Artifact), CommandError> {
+    let (features, found) = load_any(export, artifact)?;
+    if let Some(path) = artifact.filter(|_| features.is_hidden()) {
+        return Err(CommandError::Input(format!(
+            "{}: grades the hidden layer; expected features of the basis here (calm score and --compare-artifact of calm validate take \
+             both)",
+            path.display()
+        )));
+    }
+    Ok((features, found))
+}
+
+/// The same, also with the hidden layer as features.
+pub(super) fn load_any(
+    export: &Path,
+    artifact: Option<&Path>,
+) -> Result<(FeatureModel, Artifact), CommandError> {
     let Some(path) = artifact else {
         let model = FeatureModel::load(export, None)?;
         let own = Artifact::load_export(export).map_err(CommandError::input)?;
@@ -161,7 +177,7 @@ pub(in crate::cli) fn load(
     let model = GraceModel::load(export).map_err(CommandError::input)?;
     let artifact = Artifact::load(path).map_err(CommandError::input)?;
     let model = FeatureModel::for_artifact(export, model, &artifact.projection)?;
-    let own = model.projection().unwrap_or_else(|| artifact.projection.clone());
+    let own = model.stored_projection().unwrap_or_else(|| artifact.projection.clone());
     artifact
         .check_belongs_to(&model.symbols(), &own)
         .map_err(|error| CommandError::Input(format!("{}: {error}", path.display())))?;

@@ -95,6 +95,11 @@ impl ScoreLabels {
         })
     }
 
+    /// Whether a structure had a label that the model predicts.
+    pub fn has_labels(&self) -> bool {
+        self.errors.structures() > 0
+    }
+
     /// The statistics, which need a label.
     ///
     /// # Errors
@@ -123,7 +128,7 @@ impl ScoreLabels {
 fn write_figures(directory: &Path, report: &LabelledReport) -> Result<(), CommandError> {
     std::fs::create_dir_all(directory).map_err(|error| cannot_create(directory, error))?;
     let mut captions = String::new();
-    for FigureEntry { name, title, drawn } in labelled::figures(report) {
+    for FigureEntry { name, title, drawn } in labelled::figures(report, None) {
         let Ok(FigureContent { figure, caption, numbers }) = drawn else { continue };
         captions += &format!("{name}\n{title}. {}\n\n", figures::plain(&caption));
         let path = |extension: &str| directory.join(format!("{name}.{extension}"));

@@ -2,11 +2,12 @@
 
 use std::sync::Arc;
 
-use atoms::{Evaluation, Structure};
+use atoms::{Evaluation, NeighbourList, Structure};
 use calm::neighbourhood::{Pair, PairError};
 use calm::{GradeError, Grades, Mixture, NeighbourWeights, neighbourhood_average};
-use potentials::grace::{GraceModel, PullBack};
+use potentials::grace::PullBack;
 
+use crate::feature_variant::FeatureModel;
 use crate::features::{FeatureCalculator, FeatureError};
 
 /// A model, a mixture that grades its features, and work arrays.
@@ -43,10 +44,10 @@ pub enum ScoreError {
 }
 
 impl Scorer {
-    /// `mixture` must belong to `model`.
-    pub fn new(model: Arc<GraceModel>, mixture: Arc<Mixture>) -> Self {
+    /// `mixture` must be one of these features.
+    pub fn new(features: &FeatureModel, mixture: Arc<Mixture>) -> Self {
         Self {
-            features: FeatureCalculator::new(model),
+            features: features.calculator(),
             mixture,
             cotangent: Vec::new(),
             grades: Grades::default(),
@@ -58,9 +59,14 @@ impl Scorer {
         }
     }
 
+    /// Neighbours in the last structure within the cutoff of the model.
+    pub fn neighbours(&self) -> &NeighbourList {
+        &self.features.neighbours
+    }
+
     /// Features z of the last structure, [n × D].
     pub fn features(&self) -> &[f64] {
-        self.features.grace.features()
+        self.features.features()
     }
 
     /// The average of γ over the neighbours of the last structure with other weights than γ_nbr has, [n].
@@ -75,7 +81,7 @@ impl Scorer {
     /// Evaluates and grades `structure`; with `gradient`, also computes the gradient of Σγ.
     pub fn score(&mut self, structure: &Structure, gradient: bool) -> Result<(), ScoreError> {
         let elements = self.features.compute(structure)?;
-        let features = self.features.grace.features();
+        let features = self.features.features();
         self.cotangent.resize(features.len(), 0.0);
         let cotangent = gradient.then_some(self.cotangent.as_mut_slice());
         self.grades.evaluate(&self.mixture, &elements, features, cotangent)?;
@@ -83,7 +89,7 @@ impl Scorer {
         self.elements = elements;
         self.gamma_nbr = neighbourhood_average(&self.grades.gamma, self.pairs.iter().copied())?;
         let cotangent = gradient.then_some(self.cotangent.as_slice());
-        self.features.grace.backward(cotangent, &mut self.evaluation, &mut self.pull_back);
+        self.features.backward(cotangent, &mut self.evaluation, &mut self.pull_back);
         Ok(())
     }
 }

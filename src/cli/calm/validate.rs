@@ -12,14 +12,13 @@ use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
 use super::other_scores::OtherScores;
-use super::score::load;
-use super::scorer::Scorer;
-use super::validate_labels;
+use super::score::{load, load_any};
+use super::validate_labels::{self, LabelledComparison, NamedMixture};
 use crate::atomic_file::refuse_to_replace;
-use crate::calm_validation::labelled::ComparedMixture;
+use crate::calm_validation::labelled::LabelledSet;
 use crate::calm_validation::{
-    self, AtomScore, EnergySpread, FeaturePlanes, LabelledResults, MixtureScore, PAGE, Subject, Validation,
-    ValidationProgress, ValidationSettings, both, labelled, verdict,
+    self, AtomScore, EnergySpread, FeaturePlanes, LabelledResults, MixtureScore, PAGE, Subject,
+    TrainingCompositions, Validation, ValidationProgress, ValidationSettings, both, labelled, verdict,
 };
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureModel;
@@ -28,9 +27,6 @@ use crate::page::{create_directory, write_files};
 use crate::signals::stop_token;
 
 const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
-
-/// A mixture with its file and its features.
-type NamedMixture = (PathBuf, FeatureModel, Arc<Mixture>);
 
 /// Metals up to which all pairs are mixed by default.
 const MIXED: usize = 4;
@@ -61,9 +57,17 @@ pub struct CalmValidateArgs {
     #[arg(long, value_name = "MODEL.npz")]
     ensemble: Vec<PathBuf>,
     /// Structures with labels, extended XYZ. The page also shows how well γ, γ_nbr and the other scores of an atom predict large force
-    /// errors
-    #[arg(long, value_name = "LABELLED.extxyz")]
-    labelled: Option<PathBuf>,
+    /// errors. Several files are several sets, each with a section of its own, and a table with all of them
+    #[arg(long, value_name = "LABELLED.extxyz", num_args = 1..)]
+    labelled: Vec<PathBuf>,
+    /// Training data of the model, extended XYZ; several files are allowed. The solid solutions are drawn with the compositions and first
+    /// shells of these structures, and the errors by composition with the errors of the model on them
+    #[arg(long, value_name = "TRAINING.extxyz", num_args = 1..)]
+    training: Vec<PathBuf>,
+    /// Another model with a mixture in its file; may be repeated. Its force errors on the labelled structures are drawn by its own γ_nbr
+    /// below those of the model
+    #[arg(long, value_name = "MODEL.npz", requires = "labelled")]
+    compare_model: Vec<PathBuf>,
     /// Also judge γ averaged with these weights over the neighbours of the labelled structures, as calm score --gamma-nbr does; may be
     /// repeated
     #[arg(long, value_name = "WEIGHTS[:RADIUS]", requires = "labelled")]
@@ -107,25 +111,19 @@ impl CalmValidateArgs {
         let spread = self.ensemble(&model)?;
         let mut compared = self.compared(&features)?;
         let mixtures = self.mixtures(&features, &mixture)?;
+        let models = self.models()?;
         let further = mixture_scores(&features, mixtures.get(1..).unwrap_or_default());
         let others = further.into_iter().chain(compared.baselines()).chain(spread).collect();
         // Fail before the long computation.
         create_directory(&self.output)?;
         let stop = stop_token()?;
+        let own = NamedMixture { file: self.model.clone(), features, mixture: mixture.clone() };
         let planes = FeaturePlanes::new(&mixture, model.elements(), &settings.elements);
-        let mut labelled = LabelledResults { report: None, mixtures: Vec::new(), planes };
-        if let Some(input) = &self.labelled {
-            let mut scorer = Scorer::new(model.clone(), mixture.clone());
-            let planes = Some(&mut labelled.planes);
-            labelled.report = validate_labels::report(input, &mut scorer, &mut compared, planes, &stop)?;
-            if labelled.report.is_none() {
-                return Ok(stopped());
-            }
-            let Some(mixtures) = self.compare(input, mixtures, &stop)? else {
-                return Ok(stopped());
-            };
-            labelled.mixtures = mixtures;
-        }
+        let comparison = LabelledComparison { mixtures: &mixtures, models: &models };
+        let Some(labelled) = self.labelled(&own, &mut compared, &comparison, planes, &settings, &stop)?
+        else {
+            return Ok(stopped());
+        };
         let progress = ValidationProgress::new(Bar::new(Some(1), BAR), stop);
         let subject = Subject { model, mixture, others };
         let Some(validation) = calm_validation::run(&subject, settings, labelled, &progress)? else {
@@ -138,11 +136,12 @@ impl CalmValidateArgs {
             bond_scans(&validation).write(out)?;
             writeln!(out)?;
             defects(&validation).write(out)?;
-            if let Some(report) = &validation.labelled {
-                writeln!(out)?;
+            for LabelledSet { file, report, mixtures, .. } in &validation.labelled {
+                writeln!(out, "\n{file}")?;
                 labelled::write(report, out)?;
-                labelled::write_table(&labelled::mixtures_table(&validation.mixtures, report), out)?;
+                labelled::write_table(&labelled::mixtures_table(mixtures, report), out)?;
             }
+            labelled::write_table(&labelled::sets_table(&validation.labelled), out)?;
             let page = self.output.join(PAGE);
             let others = output::count(files.len() - 1, "file");
             writeln!(out, "\nwrote {} and {others} in the same directory", page.display())
@@ -152,12 +151,11 @@ impl CalmValidateArgs {
 
     /// The baselines, and what else labelled structures are scored by beside γ and γ_nbr. The output must not replace these structures.
     fn compared(&self, features: &FeatureModel) -> Result<OtherScores, CommandError> {
-        let mut ensemble: &[PathBuf] = &[];
-        if let Some(input) = &self.labelled {
-            let structures = self.output.join("structures.extxyz");
-            refuse_to_replace(&structures, [(input.as_path(), "the file of labelled structures")])?;
-            ensemble = &self.ensemble;
-        }
+        let structures = self.output.join("structures.extxyz");
+        let labelled = self.labelled.iter().map(|path| (path.as_path(), "a file of labelled structures"));
+        let training = self.training.iter().map(|path| (path.as_path(), "a file of training data"));
+        refuse_to_replace(&structures, labelled.chain(training))?;
+        let ensemble: &[PathBuf] = if self.labelled.is_empty() { &[] } else { &self.ensemble };
         let others = OtherScores::load(&self.model, features, &self.baseline, ensemble)?;
         Ok(others.with_averages(&self.gamma_nbr))
     }
@@ -172,32 +170,51 @@ impl CalmValidateArgs {
             return Ok(Vec::new());
         }
         let file = self.artifact.as_ref().unwrap_or(&self.model).clone();
-        let mut mixtures = vec![(file, own.clone(), mixture.clone())];
+        let mut mixtures = vec![NamedMixture { file, features: own.clone(), mixture: mixture.clone() }];
         for path in &self.compare_artifact {
-            let (features, artifact) = load(&self.model, Some(path))?;
-            mixtures.push((path.clone(), features, Arc::new(artifact.mixture)));
+            let (features, artifact) = load_any(&self.model, Some(path))?;
+            let mixture = Arc::new(artifact.mixture);
+            mixtures.push(NamedMixture { file: path.clone(), features, mixture });
         }
         Ok(mixtures)
     }
 
-    /// What the labelled structures say under each mixture, γ and γ_nbr alone. `None` if it was stopped.
-    fn compare(
+    /// The further models for labelled structures, each with the mixture in its file.
+    fn models(&self) -> Result<Vec<NamedMixture>, CommandError> {
+        let named = |path: &PathBuf| {
+            let (features, artifact) = load(path, None)?;
+            Ok(NamedMixture { file: path.clone(), features, mixture: Arc::new(artifact.mixture) })
+        };
+        self.compare_model.iter().map(named).collect()
+    }
+
+    /// What labelled structures and training data say. `None` if it was stopped.
+    fn labelled(
         &self,
-        input: &Path,
-        mixtures: Vec<NamedMixture>,
+        own: &NamedMixture,
+        others: &mut OtherScores,
+        comparison: &LabelledComparison<'_>,
+        mut planes: FeaturePlanes,
+        settings: &ValidationSettings,
         stop: &CancellationToken,
-    ) -> Result<Option<Vec<ComparedMixture>>, CommandError> {
-        let mut compared = Vec::new();
-        for (file, features, mixture) in mixtures {
-            let mut scorer = Scorer::new(features.model.clone(), mixture.clone());
-            // Other scores could leave atoms out.
-            let mut none = OtherScores::load(&self.model, &features, &[], &[])?;
-            let Some(report) = validate_labels::report(input, &mut scorer, &mut none, None, stop)? else {
+    ) -> Result<Option<LabelledResults>, CommandError> {
+        let (mut sets, mut training) = (Vec::new(), None);
+        for input in &self.labelled {
+            let mut scorer = own.scorer();
+            let scores = (&mut scorer, &mut *others);
+            let Some(set) = validate_labels::set(input, scores, comparison, &mut planes, stop)? else {
                 return Ok(None);
             };
-            compared.push(ComparedMixture::new(file.display().to_string(), &mixture, &report));
+            sets.push(set);
         }
-        Ok(Some(compared))
+        if !self.training.is_empty() {
+            let empty = TrainingCompositions::new(&settings.pairs);
+            training = validate_labels::training(&self.training, &mut own.scorer(), empty, stop)?;
+            if training.is_none() {
+                return Ok(None);
+            }
+        }
+        Ok(Some(LabelledResults { sets, training, planes }))
     }
 
     /// The spread of the energies, if there are further models.
@@ -250,8 +267,8 @@ impl CalmValidateArgs {
 /// γ under each of these mixtures as a score with the name of its file. `graded` has the features that γ grades.
 fn mixture_scores(graded: &FeatureModel, mixtures: &[NamedMixture]) -> Vec<Box<dyn AtomScore>> {
     let stem = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-    let score = |(path, features, mixture): &NamedMixture| {
-        let is_only = mixtures.iter().filter(|(other, ..)| stem(other) == stem(path)).count() == 1;
+    let score = |NamedMixture { file: path, features, mixture }: &NamedMixture| {
+        let is_only = mixtures.iter().filter(|other| stem(&other.file) == stem(path)).count() == 1;
         let name = if is_only { stem(path) } else { path.display().to_string() };
         let own = (features.projection() != graded.projection()).then(|| features.clone());
         Box::new(MixtureScore::new(format!("γ ({name})"), mixture.clone(), own)) as Box<dyn AtomScore>

@@ -23,7 +23,7 @@ use crate::page::style::row;
 
 /// All figures, in the order of the page.
 pub fn all(data: &ReportData) -> Vec<FigureEntry> {
-    let part = |name, title, drawn| FigureEntry { name, title, drawn };
+    let part = |name: &'static str, title, drawn| FigureEntry { name: name.into(), title, drawn };
     let mut all = vec![
         part("collection", "Candidates and accepted structures", collection::draw(data)),
         part("pairs", "Errors of biased walks and of their controls, pair by pair", pairs::draw(data)),

@@ -2,7 +2,7 @@
 
 use ::figures::{Anchor, Axis, AxisScale, Colour, Figure, LegendKey, Marker, Panel, Rectangle, legend};
 
-use super::super::report::{CompositionGroup, CompositionScan, ErrorSpread, LabelledReport};
+use super::super::report::{CompositionGroup, CompositionScan, ErrorSpread, LabelledReport, TrainingErrors};
 use super::stroke;
 use crate::csv::{Csv, number};
 use crate::page::style::{WIDTH, axis, row};
@@ -16,7 +16,7 @@ const TOP: f64 = 36.0;
 const SHOWN: usize = 2;
 
 /// `None` if all structures have one composition.
-pub fn draw(report: &LabelledReport) -> Option<FigureEntry> {
+pub fn draw(report: &LabelledReport, training: Option<TrainingErrors>) -> Option<FigureEntry> {
     if report.compositions.is_empty() {
         return None;
     }
@@ -30,15 +30,18 @@ pub fn draw(report: &LabelledReport) -> Option<FigureEntry> {
     legend(&mut figure, [WIDTH - 8.0, 12.0], &names);
     for (k, scan) in report.compositions.iter().enumerate() {
         let places = row(3, [46.0, 54.0, 8.0], TOP + ROW * k as f64, PANEL);
-        draw_scan(&mut figure, report, scan, &places, 3 * k);
+        draw_scan(&mut figure, (report, training), scan, &places, 3 * k);
         scan.groups.iter().for_each(|group| push(&mut numbers, report, scan, group));
     }
-    let caption = "Errors of labelled structures by the share of an element among their atoms, to the nearest 10 %. Left, error of the \
-                   energy per atom without the offsets of the elements; middle, force error |F_{model} − F_{label}| of an atom. Line, mean; \
-                   bands, P_{25}–P_{75} and P_{10}–P_{90}; ρ, Spearman’s ρ of the energy error and the mean γ of a structure, and of the \
-                   force error and γ of an atom, over all compositions. Right, mean grade of the atoms; dashed, its limit.";
-    let drawn = Ok(FigureContent { figure, caption: caption.into(), numbers });
-    Some(FigureEntry { name: "composition-errors", title: "Errors by composition", drawn })
+    let known = training.map_or("", |_| "; dashed, that on the training data");
+    let caption = format!(
+        "Errors of labelled structures by the share of an element among their atoms, to the nearest 10 %. Left, error of the \
+                   energy per atom without the offsets of the elements; middle, force error |F_{{model}} − F_{{label}}| of an atom. Line, mean{known}; \
+                   bands, P_{{25}}–P_{{75}} and P_{{10}}–P_{{90}}; ρ, Spearman’s ρ of the energy error and the mean γ of a structure, and of the \
+                   force error and γ of an atom, over all compositions. Right, mean grade of the atoms; dashed, its limit."
+    );
+    let drawn = Ok(FigureContent { figure, caption, numbers });
+    Some(FigureEntry { name: "composition-errors".into(), title: "Errors by composition", drawn })
 }
 
 /// Number and name of the scores that are drawn: the first with a limit.
@@ -52,7 +55,7 @@ type SpreadOfGroup = fn(&CompositionGroup) -> Option<ErrorSpread>;
 
 fn draw_scan(
     figure: &mut Figure,
-    report: &LabelledReport,
+    (report, training): (&LabelledReport, Option<TrainingErrors>),
     scan: &CompositionScan,
     places: &[Rectangle],
     first: usize,
@@ -64,7 +67,10 @@ fn draw_scan(
         ("energy error (meV/atom)", 1000.0, |group| group.energy),
         ("force error (eV Å^{−1})", 1.0, |group| group.forces),
     ];
-    for (k, ((title, factor, of), rho)) in errors.into_iter().zip(ranks).enumerate() {
+    let known = [training.and_then(|errors| errors.energy), training.and_then(|errors| errors.force)];
+    let panels = errors.into_iter().zip(ranks).zip(known).enumerate();
+    for (k, (((title, factor, of), rho), known)) in panels {
+        let known = known.map(|error| factor * error);
         let point = |group: &CompositionGroup| {
             of(group).map(|errors| {
                 (100.0 * group.share, factor * errors.mean, errors.quantiles.map(|error| factor * error))
@@ -73,7 +79,7 @@ fn draw_scan(
         let points: Vec<_> = scan.groups.iter().filter_map(point).collect();
         let values: Vec<_> =
             points.iter().flat_map(|(_, mean, quantiles)| quantiles.iter().chain([mean])).copied().collect();
-        let mut panel = Panel::new(places[k], share(), axis(title, AxisScale::Logarithmic, &values, None));
+        let mut panel = Panel::new(places[k], share(), axis(title, AxisScale::Logarithmic, &values, known));
         for (low, high, opacity) in [(0, 4, 0.15), (1, 3, 0.25)] {
             let band = points.iter().map(|(x, _, quantiles)| (*x, quantiles[low], quantiles[high]));
             panel.band(&band.collect::<Vec<_>>(), Colour::BLUE.faint(opacity));
@@ -81,6 +87,9 @@ fn draw_scan(
         let means: Vec<_> = points.iter().map(|(x, mean, _)| [*x, *mean]).collect();
         panel.line(means.clone(), Colour::BLUE.line(1.2));
         panel.dots(means, Marker::Disc, 1.8, Colour::BLUE, None);
+        if let Some(known) = known {
+            panel.line([[0.0, known], [100.0, known]], Colour::INK.dashed(0.9));
+        }
         if points.is_empty() {
             panel.placeholder("too few labels");
         }

@@ -125,6 +125,6 @@ impl Chart {
     fn finish(self, title: &'static str, caption: String) -> FigureEntry {
         let Self { name, mut figure, panel, numbers, .. } = self;
         panel.draw(&mut figure);
-        FigureEntry { name, title, drawn: Ok(FigureContent { figure, caption, numbers }) }
+        FigureEntry { name: name.into(), title, drawn: Ok(FigureContent { figure, caption, numbers }) }
     }
 }

@@ -45,7 +45,7 @@ pub fn draw(report: &LabelledReport) -> FigureEntry {
         report.sampled_atoms
     );
     let drawn = Ok(FigureContent { figure, caption, numbers });
-    FigureEntry { name: "score-distributions", title: "Distributions of the scores", drawn }
+    FigureEntry { name: "score-distributions".into(), title: "Distributions of the scores", drawn }
 }
 
 /// Outline of the histogram of shares of `all` atoms.

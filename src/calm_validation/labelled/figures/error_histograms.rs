@@ -10,23 +10,19 @@ use crate::page::style::WIDTH;
 use crate::page::{FigureContent, FigureEntry};
 
 /// Height of a row of two panels, and of a panel, points.
-const ROW: f64 = 240.0;
-const PANEL: f64 = 180.0;
+pub const ROW: f64 = 240.0;
+pub const PANEL: f64 = 180.0;
 /// Height of the axis, in heights of the histograms, with room for words and inset.
 const ROOM: f64 = 2.2;
 /// Colours of the atoms within and beyond the limit.
 const COLOURS: [Colour; 2] = [Colour::BLUE, Colour::VERMILLION];
 
 /// A score with its limit and its histograms.
-type Split<'a> = (&'a ScoreReport, f64, &'a ErrorHistograms);
+pub type Split<'a> = (&'a ScoreReport, f64, &'a ErrorHistograms);
 
 /// `None` without a score that has a limit, or without an error above zero.
 pub fn draw(report: &LabelledReport) -> Option<FigureEntry> {
-    let shown = report
-        .scores
-        .iter()
-        .filter_map(|score| Some((score, score.limit?, score.component_histograms.as_ref()?)));
-    let shown: Vec<Split> = shown.collect();
+    let shown: Vec<Split> = report.scores.iter().filter_map(split).collect();
     if shown.is_empty() {
         return None;
     }
@@ -37,10 +33,9 @@ pub fn draw(report: &LabelledReport) -> Option<FigureEntry> {
     for (k, split) in shown.iter().enumerate() {
         let (x, y) = ([46.0, 302.0][k % 2], 24.0 + ROW * (k / 2) as f64);
         let place = Rectangle { x, y, width: 192.0, height: PANEL };
-        draw_panel(&mut figure, split, place, char::from(b'a' + k as u8));
-        let inset = Rectangle { x: place.right() - 92.0, y: y + 30.0, width: 84.0, height: 44.0 };
-        reliability::draw_inset(&mut figure, split.0, inset);
-        push(&mut numbers, split);
+        draw_split(&mut figure, split, place, char::from(b'a' + k as u8));
+        figure.text([place.x - 8.0, place.y - 6.0], &split.0.name, Anchor::Start);
+        push_split(&mut numbers, split, &split.0.name);
     }
     let names = shown.iter().map(|split| {
         let [within, beyond] = facts(split);
@@ -55,7 +50,16 @@ pub fn draw(report: &LabelledReport) -> Option<FigureEntry> {
         names.collect::<Vec<_>>().join(". ")
     );
     let drawn = Ok(FigureContent { figure, caption, numbers });
-    Some(FigureEntry { name: "error-histograms", title: "Force errors on either side of the limit", drawn })
+    Some(FigureEntry {
+        name: "error-histograms".into(),
+        title: "Force errors on either side of the limit",
+        drawn,
+    })
+}
+
+/// `None` for a score without limit, or without an error above zero.
+pub fn split(score: &ScoreReport) -> Option<Split<'_>> {
+    Some((score, score.limit?, score.component_histograms.as_ref()?))
 }
 
 /// What is said of the atoms within and beyond the limit.
@@ -70,7 +74,8 @@ fn facts((score, limit, histograms): &Split) -> [String; 2] {
     [of(format!("≤ {limit}"), 0), of(format!("> {limit}{flagged}"), 1)]
 }
 
-fn draw_panel(figure: &mut Figure, split: &Split, place: Rectangle, letter: char) {
+/// A panel with its inset.
+pub fn draw_split(figure: &mut Figure, split: &Split, place: Rectangle, letter: char) {
     let (score, _, histograms) = split;
     let outlines = outlines(histograms);
     let most = outlines.iter().flatten().map(|[_, share]| *share).fold(0.0, f64::max);
@@ -86,14 +91,16 @@ fn draw_panel(figure: &mut Figure, split: &Split, place: Rectangle, letter: char
     }
     panel.panel_letter(letter);
     panel.draw(figure);
-    figure.text([place.x - 8.0, place.y - 6.0], &score.name, Anchor::Start);
+    let inset = Rectangle { x: place.right() - 92.0, y: place.y + 30.0, width: 84.0, height: 44.0 };
+    reliability::draw_inset(figure, score, inset);
 }
 
-fn push(numbers: &mut Csv, (score, _, histograms): &Split) {
+/// The numbers of a panel, which has this name.
+pub fn push_split(numbers: &mut Csv, (_, _, histograms): &Split, name: &str) {
     let [within, beyond] = &histograms.populations;
     let counts = within.counts.iter().zip(&beyond.counts);
     for (edges, (within, beyond)) in histograms.edges.windows(2).zip(counts) {
-        let name = ::figures::plain(&score.name);
+        let name = ::figures::plain(name);
         numbers.push(&[name, number(edges[0]), number(edges[1]), within.to_string(), beyond.to_string()]);
     }
 }

@@ -40,7 +40,11 @@ pub fn draw(mixtures: &[ComparedMixture], report: &LabelledReport) -> Option<Fig
     let curves = MixtureCurves::new(mixtures, report);
     let drawn =
         Ok(FigureContent { figure: curves.figure(), caption: curves.caption(), numbers: curves.numbers() });
-    Some(FigureEntry { name: "mixture-contamination", title: "Contamination under several mixtures", drawn })
+    Some(FigureEntry {
+        name: "mixture-contamination".into(),
+        title: "Contamination under several mixtures",
+        drawn,
+    })
 }
 
 impl<'a> MixtureCurves<'a> {

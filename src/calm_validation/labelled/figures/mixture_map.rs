@@ -55,7 +55,11 @@ pub fn draw(mixtures: &[ComparedMixture], report: &LabelledReport) -> Option<Fig
         return None;
     }
     let drawn = draw_map(mixtures, report);
-    Some(FigureEntry { name: "mixture-map", title: "Contamination by dimension and components", drawn })
+    Some(FigureEntry {
+        name: "mixture-map".into(),
+        title: "Contamination by dimension and components",
+        drawn,
+    })
 }
 
 fn draw_map(mixtures: &[ComparedMixture], report: &LabelledReport) -> Result<FigureContent, String> {

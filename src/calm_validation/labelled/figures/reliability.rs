@@ -37,7 +37,7 @@ pub fn draw(report: &LabelledReport) -> FigureEntry {
         shown.iter().map(|score| facts(score)).collect::<Vec<_>>().join("; ")
     );
     let drawn = Ok(FigureContent { figure, caption, numbers });
-    FigureEntry { name: "reliability", title: "Reliability of the threshold", drawn }
+    FigureEntry { name: "reliability".into(), title: "Reliability of the threshold", drawn }
 }
 
 fn facts(score: &ScoreReport) -> String {

@@ -1,0 +1,147 @@
+//! How many directions the features of an environment tell apart: the rank of their Jacobian by the positions (paper, SI1).
+
+use std::collections::BTreeMap;
+
+use analysis::singular_values;
+use atoms::Species;
+use potentials::grace::PullBack;
+use serde::Serialize;
+
+use super::feature_match::cluster;
+use super::search::{MatchedFeatures, NEIGHBOURS, allowed, first_environment, searched};
+use crate::all_cores;
+use crate::calm_validation::random::RandomSequence;
+use crate::calm_validation::{Subject, ValidationProgress, ValidationSettings};
+use crate::features::FeatureCalculator;
+
+/// Singular values below this share of the largest are rounding.
+const ROUNDING: f64 = 1e-10;
+/// Random combinations of rows beyond the largest possible rank: with probability 1, they have the rank of all rows.
+pub const SURPLUS: usize = 4;
+/// Number of the first sequence of random numbers; the searches have those before.
+const SEQUENCES: u64 = 1 << 41;
+
+/// What is examined for each element: which features, and whether those of all atoms or of the one in the middle.
+const EXAMINED: [(MatchedFeatures, bool); 4] = [
+    (MatchedFeatures::HiddenLayer, false),
+    (MatchedFeatures::HiddenLayer, true),
+    (MatchedFeatures::Graded, false),
+    (MatchedFeatures::Graded, true),
+];
+
+/// The rank of the Jacobian of the features at the first environment of an element's searches.
+#[derive(Clone, Debug, Serialize)]
+pub struct FeatureRank {
+    /// The element.
+    pub element: String,
+    /// Which features.
+    pub features: MatchedFeatures,
+    /// Atoms whose features count: the one in the middle, or all.
+    pub atoms: usize,
+    /// Features of them.
+    pub dimension: usize,
+    /// Directions of all N atoms without translations and rotations: 3N − 6.
+    pub directions: usize,
+    /// Directions that change a feature.
+    pub rank: usize,
+    /// The smallest singular value that counts, relative to the largest.
+    pub smallest: f64,
+    /// The largest one that does not; `None` if all count.
+    pub next: Option<f64>,
+}
+
+impl FeatureRank {
+    /// Directions of the null space: no feature changes along them.
+    pub fn free(&self) -> usize {
+        self.directions.saturating_sub(self.rank)
+    }
+}
+
+/// Number of Jacobians.
+pub fn count(settings: &ValidationSettings) -> usize {
+    searched(settings).count() * EXAMINED.len()
+}
+
+/// Ranks for the elements whose pairs are searched, with their equilibrium distances, Å.
+pub fn run(
+    subject: &Subject,
+    settings: &ValidationSettings,
+    distances: &BTreeMap<String, f64>,
+    progress: &ValidationProgress,
+) -> Vec<FeatureRank> {
+    let tasks = searched(settings).flat_map(|species| EXAMINED.map(|examined| (species, examined)));
+    let found = all_cores::map(
+        tasks.collect::<Vec<_>>().into_iter(),
+        || {
+            let model = &subject.model;
+            [FeatureCalculator::of_hidden_layer(model.clone()), FeatureCalculator::new(model.clone())]
+        },
+        |[hidden, graded], (species, (features, of_all))| {
+            let calculator = match features {
+                MatchedFeatures::HiddenLayer => hidden,
+                MatchedFeatures::Graded => graded,
+            };
+            let equilibrium = distances[species.symbol()];
+            let found = (!progress.is_stopped())
+                .then(|| examine(calculator, settings.seed, (species, equilibrium), (features, of_all)));
+            progress.advance();
+            found.flatten()
+        },
+    );
+    found.into_iter().flatten().collect()
+}
+
+/// `None` without features, or if the environment has no room.
+fn examine(
+    calculator: &mut FeatureCalculator,
+    seed: u64,
+    (species, equilibrium): (Species, f64),
+    (features, of_all): (MatchedFeatures, bool),
+) -> Option<FeatureRank> {
+    let allowed = allowed(calculator.grace.model(), species, equilibrium)?;
+    let neighbours = first_environment(seed, (species, allowed), NEIGHBOURS)?;
+    calculator.compute(&cluster(species, &neighbours)).ok()?;
+    let number = 1 + neighbours.len();
+    let atoms = if of_all { number } else { 1 };
+    let dimension = atoms * calculator.dimension();
+    let sequence = SEQUENCES + u64::from(species.atomic_number());
+    let mut random = RandomSequence::new(seed, sequence);
+    let weights = random_weights(dimension.min(3 * number) + SURPLUS, dimension, &mut random);
+    let values = singular_values(&combined_rows(calculator, &weights), 3 * number)?;
+    let largest = values[0];
+    let rank = rank(&values);
+    Some(FeatureRank {
+        element: species.to_string(),
+        features,
+        atoms,
+        dimension,
+        directions: 3 * number - 6,
+        rank,
+        smallest: values[rank.checked_sub(1)?] / largest,
+        next: values.get(rank).map(|next| next / largest),
+    })
+}
+
+/// Number of singular values above rounding.
+pub fn rank(values: &[f64]) -> usize {
+    let limit = ROUNDING * values.first().copied().unwrap_or(0.0);
+    values.iter().filter(|value| **value > limit).count()
+}
+
+/// Standard normal numbers, `[count][dimension]`.
+pub fn random_weights(count: usize, dimension: usize, random: &mut RandomSequence) -> Vec<Vec<f64>> {
+    (0..count).map(|_| (0..dimension).map(|_| random.normal()).collect()).collect()
+}
+
+/// Gradients of combinations of the features of the last structure by the coordinates of its n atoms, `[weights × 3n]`, 1/Å. Each combination
+/// has a weight for the first features: those of the first atom, then those of the second, and so on.
+pub fn combined_rows(calculator: &mut FeatureCalculator, weights: &[Vec<f64>]) -> Vec<f64> {
+    let (mut cotangent, mut pull_back) = (vec![0.0; calculator.features().len()], PullBack::default());
+    let mut rows = Vec::new();
+    for weights in weights {
+        cotangent[..weights.len()].copy_from_slice(weights);
+        calculator.pull_back(&cotangent, &mut pull_back);
+        rows.extend_from_slice(pull_back.gradient.as_flattened());
+    }
+    rows
+}
