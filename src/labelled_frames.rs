@@ -15,6 +15,8 @@ use crate::structure_files::{FileLine, StructureFile, StructureFiles};
 
 /// The key of a frame with the name of its seed structure, as `calmwalk export` writes it.
 const GROUP: &str = "seed_structure";
+/// The key with the name of the candidate.
+const CANDIDATE: &str = "candidate_id";
 
 /// A file of labelled structures, for the note in the model.
 #[derive(Clone, Debug, Serialize)]
@@ -117,7 +119,11 @@ fn labelled_frame(frame: Frame, file: &StructureFile) -> Result<(LabelledFrame, 
     let labels =
         frame.labels().map_err(|error| CommandError::Input(format!("{}: {error}", file.path.display())))?;
     let has_stress = labels.stress.is_some();
-    let place = FileLine { file: Arc::clone(&file.path), line: frame.line }.to_string();
+    let mut place = FileLine { file: Arc::clone(&file.path), line: frame.line }.to_string();
+    if let Some(candidate) = frame.info.get(CANDIDATE) {
+        // What commands such as calmwalk exclude need.
+        place += &format!(" (candidate {candidate})");
+    }
     let group = frame.info.get(GROUP).map_or_else(|| place.clone(), ToString::to_string);
     let weight = file.weight_of(&frame)?;
     let labelled = LabelledFrame::new(place, group, frame.structure, labels, weight);

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use crate::common;
 use crate::common::campaign::{Counters, Outcome, Small, outcome};
+use crate::common::hosts::{run_in_one_process, uninterrupted, uninterrupted_outcome};
 use crate::common::label_campaign::WRITE_FIXED_LABEL;
 use crate::common::processes::{
     assert_no_leftovers, calculation_processes, pause_walkers, processes_in, processes_running, signal,
@@ -37,37 +38,6 @@ fn with_program(small: &Small, directory: &Path) {
     let command = r#"{ command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } }"#;
     let keys = format!("[label]\nmax_attempts = 20\nscratch = {scratch:?}\nmethod = {command} # ");
     std::fs::write(small.write(directory), small.text().replace("[label]\nmethod", &keys)).unwrap();
-}
-
-/// Writes a campaign that trains two versions of its potential.
-fn with_versions(small: &Small, directory: &Path) {
-    let seed_frames = std::fs::read_to_string(common::config("data/al_eam_1l/seed_frames.extxyz")).unwrap();
-    let replay: Vec<&str> = seed_frames.lines().take(6 * 110).collect();
-    std::fs::write(directory.join("replay.extxyz"), replay.join("\n") + "\n").unwrap();
-    let refit = r#"
-[refit]
-replay = ["replay.extxyz"]
-after_structures = 5
-max_versions = 2
-held_out = 0.5
-max_held_out_error_ratio = 10.0
-max_attempts = 100
-control_frames = "compare"
-start = "first"
-method = { native = { epochs = 2, validation_share = 0.0 } }
-test_sets = [{ name = "known", file = "replay.extxyz" }]
-comparisons = [{ name = "known", file = "replay.extxyz" }]
-"#;
-    std::fs::write(small.write(directory), small.text() + refit).unwrap();
-}
-
-/// Runs a campaign without interruption in a single process. Returns its outcome and duration.
-fn uninterrupted_outcome(small: &Small, write: Write) -> (Outcome, Duration) {
-    let directory = tempfile::tempdir().unwrap();
-    write(small, directory.path());
-    let begun = Instant::now();
-    assert_eq!(start(directory.path(), &["--in-process"]).0.wait().unwrap().code(), Some(0));
-    (outcome(directory.path()), begun.elapsed())
 }
 
 /// Maximum number of kills of labelling programs per campaign: each kill counts as a failure of its job, whose retries are
@@ -107,8 +77,13 @@ fn kill(directory: &Path, running: &Running, choice: u64, programs_too: bool) ->
 }
 
 /// Runs campaigns with some kills in each, at any time from the start on, with one or two walkers.
-fn disturbed(small: &Small, write: Write, options: &[&str], kills: u64) -> Outcome {
-    let (expected, takes) = uninterrupted_outcome(&Small { walkers: 1, ..small.clone() }, write);
+fn disturbed(
+    small: &Small,
+    write: Write,
+    (expected, takes): (Outcome, Duration),
+    options: &[&str],
+    kills: u64,
+) -> Outcome {
     assert!(expected.decisions.matches("\"kind\":\"accepted\"").count() >= 4, "{}", expected.decisions);
     assert!(expected.decisions.contains("\"kind\":\"control\""));
     let (mut done, mut campaigns) = (0, 0);
@@ -146,23 +121,27 @@ fn disturbed(small: &Small, write: Write, options: &[&str], kills: u64) -> Outco
 
 #[test]
 fn kills_at_random_times_change_nothing() {
-    disturbed(&Small::default(), plain, &[], kills());
+    let small = Small::default();
+    disturbed(&small, plain, uninterrupted(&small), &[], kills());
 }
 
 #[test]
 fn kills_of_a_run_in_one_process_change_nothing() {
-    disturbed(&Small::default(), plain, &["--in-process"], kills().div_ceil(4));
+    let small = Small::default();
+    disturbed(&small, plain, uninterrupted(&small), &["--in-process"], kills().div_ceil(4));
 }
 
 #[test]
 fn kills_of_a_campaign_whose_labels_a_program_makes_change_nothing() {
-    disturbed(&Small::default(), with_program, &[], kills().div_ceil(4));
+    let small = Small { walkers: 1, ..Small::default() };
+    let alone = run_in_one_process(|directory| with_program(&small, directory));
+    disturbed(&small, with_program, alone, &[], kills().div_ceil(4));
 }
 
 #[test]
 fn kills_of_a_campaign_that_trains_its_potential_change_nothing() {
-    let small = Small { max_per_walk: 3, ..Small::default() };
-    let expected = disturbed(&small, with_versions, &[], kills().div_ceil(4));
+    let small = Small::with_two_versions();
+    let expected = disturbed(&small, plain, uninterrupted(&small), &[], kills().div_ceil(4));
     let found: Vec<_> =
         expected.versions.iter().map(|version| (version.number, version.state.name())).collect();
     assert_eq!(found, [(1, "registered"), (2, "registered")], "{:?}", expected.versions);
@@ -173,7 +152,7 @@ fn kills_of_a_campaign_that_trains_its_potential_change_nothing() {
 #[test]
 fn ctrl_c_and_sigterm_stop_cleanly_and_lose_nothing() {
     let small = Small::default();
-    let (expected, _) = uninterrupted_outcome(&small, plain);
+    let expected = uninterrupted_outcome(&small);
     for name in ["INT", "TERM"] {
         let directory = tempfile::tempdir().unwrap();
         small.write(directory.path());
@@ -192,8 +171,9 @@ fn ctrl_c_and_sigterm_stop_cleanly_and_lose_nothing() {
 
 #[test]
 fn live_mode_loses_and_duplicates_nothing() {
+    // Live mode takes about as long as reproducible mode.
+    let (_, takes) = uninterrupted(&Small::default());
     let small = Small { mode: "live", ..Small::default() };
-    let (_, takes) = uninterrupted_outcome(&small, plain);
     let directory = tempfile::tempdir().unwrap();
     small.write(directory.path());
     for kill in 0..5 {

@@ -45,6 +45,7 @@ mod places;
 mod processes;
 mod reference_check;
 mod refit;
+mod refit_campaigns;
 mod relabel;
 mod replay;
 mod scheduling;

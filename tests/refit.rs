@@ -1,5 +1,7 @@
 //! `calmwalk refitter`: trains, judges and registers a version of the potential, or refuses it.
 
+mod wrong_data;
+
 use std::collections::BTreeSet;
 use std::fs;
 use std::io::Write;

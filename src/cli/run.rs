@@ -197,6 +197,7 @@ async fn run(
     let process = registration::register(&store).await?;
     say_what_is_idle(campaign, location);
     let (stop, superseded) = (CancellationToken::new(), CancellationToken::new());
+    let walks_end = superseded.child_token();
     let run = runtime::RunContext {
         campaign,
         store: &store,
@@ -205,6 +206,7 @@ async fn run(
         listen,
         stop: &stop,
         superseded: &superseded,
+        walks_end: &walks_end,
     };
     let mode = runtime::RunMode { in_process, accepted_check: accept_reference_check };
     let surroundings = Surroundings { location, lock: lock.as_ref(), web };

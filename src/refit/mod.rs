@@ -404,7 +404,8 @@ impl Refit<'_> {
             number: self.set.number,
             parent: self.config.parent_version,
             state: if is_refused { VersionState::Refused } else { VersionState::Registered },
-            reason: reason.unwrap_or_default(),
+            // The directory is removed, and the record must not depend on where the campaign is.
+            reason: without_directory(&reason.unwrap_or_default(), &self.directory),
             method: self.config.settings.method.name().to_owned(),
             structures: self.set.accepted,
             last_decision: self.set.last_decision,
@@ -434,6 +435,11 @@ impl Refit<'_> {
         };
         Ok(VersionFiles { model: read(MODEL)?, mixture: read(MIXTURE)? })
     }
+}
+
+/// A message that names the files of this directory by their names.
+fn without_directory(message: &str, directory: &Path) -> String {
+    message.replace(&format!("{}/", directory.display()), "")
 }
 
 /// Number of structures in a file.

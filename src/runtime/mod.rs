@@ -58,8 +58,10 @@ pub struct RunContext<'a> {
     pub listen: Option<&'a Listen>,
     /// Cancelled to stop the run: by a signal, or when a time limit is reached.
     pub stop: &'a CancellationToken,
-    /// Cancelled when walks make room for a newer version of the potential.
+    /// Cancelled when walks make room for those of a newer version of the potential, which do not wait for labels.
     pub superseded: &'a CancellationToken,
+    /// Cancelled with [`Self::superseded`], and when the last version is there, with which no walk starts: biased walks end.
+    pub walks_end: &'a CancellationToken,
 }
 
 /// How a campaign is run, besides its [`RunContext`].
@@ -119,7 +121,7 @@ fn start_reactor(
         store: run.store.clone().with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT),
         incoming,
         stopping,
-        superseded: run.superseded.clone(),
+        superseded: run.walks_end.clone(),
         queue_limit,
     };
     let (store, throughput) = (run.store.clone(), Mutex::new(Throughput::default()));

@@ -86,8 +86,9 @@ impl<'a> RefitProcess<'a> {
         self.finish().await
     }
 
-    /// Beside the walks of a live campaign: starts refits that are due, and cancels [`RunContext::superseded`] when a version is
-    /// registered that is newer than that of the walks. Never ends without an error. Cancel-safe.
+    /// Beside the walks of a live campaign: starts refits that are due, and cancels [`RunContext::superseded`] or
+    /// [`RunContext::walks_end`] when a version is registered that is newer than that of the walks. Never ends without an error.
+    /// Cancel-safe.
     pub async fn watch(&mut self) -> CommandError {
         if self.run.campaign.config.campaign.mode != CampaignMode::Live {
             return std::future::pending().await;
@@ -139,11 +140,15 @@ impl<'a> RefitProcess<'a> {
     }
 
     async fn check(&mut self) -> Result<(), CommandError> {
-        let RunContext { store, campaign, superseded, .. } = self.run;
+        let RunContext { store, campaign, superseded, walks_end, .. } = self.run;
         let schedule = RefitSchedule::read(store, &campaign.config).await?;
-        let newest = schedule.newest().map_or(0, |version| version.number);
-        if newest > campaign.version_number() {
+        let is_newer = |version: Option<&VersionRecord>| {
+            version.is_some_and(|version| version.number > campaign.version_number())
+        };
+        if is_newer(schedule.in_force()) {
             superseded.cancel();
+        } else if is_newer(schedule.newest()) {
+            walks_end.cancel();
         } else if self.children.is_none()
             && schedule.is_due_beside_walks(self.refit, campaign_begin(store).await?, unix_milliseconds())
             && !is_another_running(store).await?

@@ -64,7 +64,8 @@ async fn run_version(
     mode: RunMode<'_>,
 ) -> Result<VersionEnd, CommandError> {
     let superseded = CancellationToken::new();
-    let run = RunContext { superseded: &superseded, ..run };
+    let walks_end = superseded.child_token();
+    let run = RunContext { superseded: &superseded, walks_end: &walks_end, ..run };
     let mut process = RefitProcess::new(run, refit);
     let ended = tokio::select! {
         ended = run_walks(run, selector, mode) => ended?,

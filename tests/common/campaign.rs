@@ -17,7 +17,28 @@ pub struct Small {
     pub steps: u64,
     pub max_per_walk: u32,
     pub seed_structures: &'static [&'static str],
+    /// The section `[refit]`, or nothing.
+    pub refit: &'static str,
 }
+
+/// Two versions of the potential, trained in a second each. Of the two default seed structures, one is held out.
+pub const TWO_VERSIONS: &str = r#"
+[refit]
+replay = ["replay.extxyz"]
+after_structures = 5
+max_versions = 2
+held_out = 0.5
+max_held_out_error_ratio = 10.0
+max_attempts = 100
+control_frames = "compare"
+start = "first"
+method = { native = { epochs = 2, validation_share = 0.0 } }
+test_sets = [{ name = "known", file = "replay.extxyz" }]
+comparisons = [{ name = "known", file = "replay.extxyz" }]
+"#;
+
+/// Number of structures of the replay data.
+const REPLAY: usize = 6;
 
 impl Default for Small {
     fn default() -> Self {
@@ -29,14 +50,20 @@ impl Default for Small {
             steps: 240,
             max_per_walk: 4,
             seed_structures,
+            refit: "",
         }
     }
 }
 
 impl Small {
+    /// A campaign that trains two versions of its potential.
+    pub fn with_two_versions() -> Self {
+        Self { max_per_walk: 3, refit: TWO_VERSIONS, ..Self::default() }
+    }
+
     /// Text of the configuration.
     pub fn text(&self) -> String {
-        let Self { mode, walkers, walks_per_round, steps, max_per_walk, .. } = self;
+        let Self { mode, walkers, walks_per_round, steps, max_per_walk, refit, .. } = self;
         let file = |path: &str| config(path).display().to_string();
         format!(
             r#"
@@ -70,7 +97,7 @@ method = {{ potential = {{ kind = "eam_fs", file = "{label}" }} }}
 walkers = {walkers}
 walks_per_round = {walks_per_round}
 steps_per_assignment = 40
-"#,
+{refit}"#,
             model = file("data/al_eam_1l/kokkos.npz"),
             artifact = file("data/al_eam_1l/gmm_artifacts.npz"),
             frames = file("data/al_eam_1l/seed_frames.extxyz"),
@@ -78,7 +105,7 @@ steps_per_assignment = 40
         )
     }
 
-    /// Writes configuration and seed structures into `directory`. Returns the path of the configuration.
+    /// Writes configuration, seed structures and, for a refit, replay data into `directory`. Returns the path of the configuration.
     pub fn write(&self, directory: &Path) -> PathBuf {
         let frames =
             atoms::read_extxyz(&config("data/aluminium_seeds.extxyz")).expect("the demo's seed structures");
@@ -89,6 +116,11 @@ steps_per_assignment = 40
             atoms::extxyz::write_frame(&mut seeds, frame).expect("memory");
         }
         fs::write(directory.join("seeds.extxyz"), seeds).expect("a directory to write in");
+        if !self.refit.is_empty() {
+            let known =
+                atoms::read_extxyz(&config("data/al_eam_1l/seed_frames.extxyz")).expect("the demo's data");
+            super::write_frames(&directory.join("replay.extxyz"), &known[..REPLAY]);
+        }
         let path = directory.join("campaign.toml");
         fs::write(&path, self.text()).expect("a directory to write in");
         path

@@ -6,6 +6,7 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex, OnceLock};
+use std::time::{Duration, Instant};
 
 use tempfile::TempDir;
 use wire::shm_dir::ShmDir;
@@ -93,23 +94,33 @@ pub fn started(command: &mut Command, said: &Path) -> Running {
     Running(command.stdout(Stdio::null()).stderr(said).spawn().expect("the program starts"))
 }
 
-/// The outcome of the campaign in a single process. A reproducible campaign has one outcome, so each is run once for all tests of
-/// a test program.
+/// The outcome of a campaign, and how long it took.
+pub type Ended = (Outcome, Duration);
+
+/// The outcome of the campaign in a single process.
 pub fn uninterrupted_outcome(small: &Small) -> Outcome {
-    static OUTCOMES: Mutex<BTreeMap<Small, Arc<OnceLock<Outcome>>>> = Mutex::new(BTreeMap::new());
+    uninterrupted(small).0
+}
+
+/// The same, and how long the campaign took. A reproducible campaign has one outcome, so each is run once for all tests of a test
+/// program.
+pub fn uninterrupted(small: &Small) -> Ended {
+    static OUTCOMES: Mutex<BTreeMap<Small, Arc<OnceLock<Ended>>>> = Mutex::new(BTreeMap::new());
     assert_eq!(small.mode, "reproducible", "only these campaigns have one outcome");
     // A single process starts no walkers.
     let small = Small { walkers: 1, ..small.clone() };
     let outcome = Arc::clone(OUTCOMES.lock().unwrap().entry(small.clone()).or_default());
-    outcome.get_or_init(|| run_in_one_process(&small)).clone()
+    outcome.get_or_init(|| run_in_one_process(|directory| drop(small.write(directory)))).clone()
 }
 
-fn run_in_one_process(small: &Small) -> Outcome {
+/// Runs the campaign that `write` writes into a directory.
+pub fn run_in_one_process(write: impl FnOnce(&Path)) -> Ended {
     let directory = tempfile::tempdir().unwrap();
-    small.write(directory.path());
+    write(directory.path());
     let mut command = program(directory.path());
     command.args(["run", "campaign.toml", "--directory", ".", "--in-process"]);
+    let begun = Instant::now();
     let ended = command.stdout(Stdio::null()).stderr(Stdio::null()).status().unwrap();
     assert_eq!(ended.code(), Some(0));
-    outcome(directory.path())
+    (outcome(directory.path()), begun.elapsed())
 }

@@ -8,5 +8,6 @@
 mod answers;
 mod clocks;
 mod kills;
+mod refits;
 mod restarts;
 mod server;

@@ -1,0 +1,233 @@
+//! Campaigns with `[refit]` from their begin to their end: live mode, agents, a refit by hand, a small improvement, wrong labels.
+
+use std::fs;
+use std::path::Path;
+use std::process::Stdio;
+
+use atoms::extxyz::Frame;
+use atoms::read_extxyz;
+use serde_json::Value as Json;
+use store::Fate;
+
+use crate::common::campaign::{Outcome, Small, outcome};
+use crate::common::hosts::{Hosts, uninterrupted_outcome};
+use crate::common::label_campaign::on_store;
+use crate::common::processes::{assert_no_leftovers, pause_walkers, signal, wait_for_process, wait_until};
+use crate::common::{Running, config, deviation, program, succeed, write_frames};
+
+const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "."];
+
+fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Json {
+    serde_json::from_str(&succeed(here, arguments.into_iter().chain(["--json"]))).unwrap()
+}
+
+/// Number and state of each version and attempt.
+fn states(outcome: &Outcome) -> Vec<(u32, &str)> {
+    outcome.versions.iter().map(|version| (version.number, version.state.name())).collect()
+}
+
+/// Walks without an end: the campaign ends when the second version is there. At least eight structures are found between two refits.
+const WITHOUT_END: &str = r#"
+[refit]
+replay = ["replay.extxyz"]
+after_structures = 8
+max_versions = 2
+held_out = 0.0
+method = { native = { epochs = 2, validation_share = 0.0 } }
+"#;
+
+#[test]
+fn a_live_campaign_ends_with_its_last_version() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let small =
+        Small { mode: "live", steps: 100_000, max_per_walk: 1_000, refit: WITHOUT_END, ..Small::default() };
+    // A control walk would run to its end.
+    let text = small.text().replacen("rng_seed = 7\n", "rng_seed = 7\ncontrol = false\n", 1);
+    fs::write(small.write(here), text).unwrap();
+    let said = succeed(here, RUN);
+    assert!(said.contains("2 versions of the potential trained (refit.max_versions)"), "{said}");
+
+    // Each accepted structure has one label, also those that were found just before the end.
+    let outcome = outcome(here);
+    assert_eq!(states(&outcome), [(1, "registered"), (2, "registered")]);
+    let [first, second] = &outcome.versions[..] else { panic!("two versions") };
+    assert!(first.labels > 0 && second.labels > first.labels, "{first:?} {second:?}");
+    let found = [0, 1, 2].map(|number| json(here, ["versions", ".", "show", &number.to_string()]));
+    let accepted = found.each_ref().map(|one| one["found"]["candidates"]["accepted"].as_u64().unwrap_or(0));
+    assert!(accepted[0] >= 8 && accepted[1] > 0 && accepted[2] == 0, "{accepted:?}");
+    assert_eq!(accepted.iter().sum::<u64>(), json(here, ["status", "."])["candidates"]["accepted"]);
+    let checked = succeed(here, ["store", "check", "."]);
+    assert!(checked.contains("no problems found"), "{checked}");
+    assert_no_leftovers(here);
+}
+
+#[test]
+fn an_agent_takes_new_versions_up() {
+    let small = Small::with_two_versions();
+    let mut hosts = Hosts::new(&small, 1, "");
+    // The file tells the agent when the campaign is over.
+    let endpoint = hosts.home.path().join("endpoint").display().to_string();
+    hosts.options[0] = vec!["--announce".into(), endpoint.clone()];
+    hosts.endpoints[1] = format!("@{endpoint}");
+    let mut orchestrator = hosts.start_orchestrator();
+    // The walks must not end before the agent joins.
+    let held = pause_walkers(hosts.home.path(), 1);
+    let mut agent = hosts.agent(0);
+    let joined = |times: usize| hosts.said(0).matches("joined: 1 walker,").count() == times;
+    wait_until("the agent has joined", || joined(1));
+    held.resume();
+    wait_until("there is another version", || {
+        hosts.orchestrator_stderr().contains("version 1 of the potential is in force")
+    });
+    let held = pause_walkers(hosts.home.path(), 1);
+    wait_until("the agent has joined again", || joined(2));
+    held.resume();
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.orchestrator_stderr());
+    assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
+    assert!(hosts.said(0).contains("no more walks with this version of the potential"), "{}", hosts.said(0));
+    assert_eq!(outcome(hosts.home.path()), uninterrupted_outcome(&small));
+    hosts.assert_cleaned_up();
+}
+
+#[test]
+fn a_version_trained_by_hand_is_that_which_the_run_would_have_trained() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let small = Small::with_two_versions();
+    small.write(here);
+    let mut command = program(here);
+    let child = command.args(RUN).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let mut running = Running(child);
+    wait_for_process(here, "refitter");
+    signal(running.0.id(), "INT");
+    assert_eq!(running.0.wait().unwrap().code(), Some(130));
+    let said = succeed(here, ["refit", "."]);
+    assert!(said.starts_with("version 1 is registered, trained on "), "{said}");
+
+    // A file of the version with another content is written again.
+    fs::create_dir_all(here.join("versions/1")).unwrap();
+    fs::write(here.join("versions/1/kokkos.npz"), "no model").unwrap();
+    succeed(here, RUN);
+    assert_eq!(outcome(here), uninterrupted_outcome(&small));
+    let replayed = json(here, ["replay", "."]);
+    assert_eq!(
+        (&replayed["difference"], &replayed["same_mixture"]),
+        (&Json::Null, &true.into()),
+        "{replayed}"
+    );
+    check_export(here);
+}
+
+/// The exported model and mixture give a structure the grades that the walker gave it.
+fn check_export(here: &Path) {
+    let (candidates, versions) = on_store(here.into(), async |store| {
+        (store.candidates(0, false, u32::MAX).await.unwrap(), store.walk_versions().await.unwrap())
+    });
+    let last = candidates.iter().rfind(|candidate| candidate.fate == Fate::Accepted).unwrap();
+    let candidate = last.block.view().to_candidate();
+    assert_eq!(versions.of_candidate(&candidate.id.to_string()), 1);
+    let frame = Frame::from(candidate.structure.clone());
+    write_frames(&here.join("found.extxyz"), &[frame]);
+
+    let version = candidate.mixture_version.to_string();
+    let files = ["--output", "mixture.npz", "--embed", "model.npz"];
+    succeed(here, ["calm", "export", ".", "--version", &version].into_iter().chain(files));
+    let info = succeed(here, ["calm", "info", "mixture.npz"]);
+    assert!(info.contains("Al"), "{info}");
+    let info = succeed(here, ["calm", "info", "model.npz"]);
+    assert!(info.contains("upfit, on "), "{info}");
+    let graded = |model: &str| {
+        succeed(here, ["calm", "score", "--model", model, "found.extxyz", "--output", "graded.extxyz"]);
+        let frames = read_extxyz(&here.join("graded.extxyz")).unwrap();
+        deviation(&frames[0].arrays["gamma"].reals().unwrap(), &candidate.gamma)
+    };
+    // Numbers of an artifact have single precision.
+    let found = graded("model.npz");
+    assert!(found < 1e-3, "{found}");
+    let by_first = graded(config("data/al_eam_1l/kokkos.npz").to_str().unwrap());
+    assert!(by_first > 1e-2, "{by_first}");
+}
+
+/// No version falls by 100 times its error.
+const CONVERGED: &str = r#"
+[refit]
+replay = ["replay.extxyz"]
+after_structures = 3
+max_versions = 9
+held_out = 0.5
+max_held_out_error_ratio = 10.0
+method = { native = { epochs = 1, validation_share = 0.0 } }
+[stop]
+min_improvement = 100.0
+"#;
+
+#[test]
+fn a_campaign_ends_when_a_version_improves_too_little() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    Small { refit: CONVERGED, ..Small::default() }.write(here);
+    let summary = succeed(here, RUN);
+    let reason = ["the held-out force error of version 1 ", " per 100 labels (stop.min_improvement)"];
+    let names_reason = |text: &str| reason.iter().all(|part| text.contains(part));
+    assert!(names_reason(&summary), "{summary}");
+    let status = succeed(here, ["status", "."]);
+    assert!(names_reason(&status), "{status}");
+    let end = &json(here, ["status", "."])["end_reason"];
+    assert_eq!((&end["kind"], &end["version"]), (&"small_improvement".into(), &1.into()), "{end}");
+    // No walk runs with it, also not after another run.
+    let decisions = || on_store(here.into(), async |store| store.decision_log_text().await.unwrap());
+    let before = decisions();
+    assert!(names_reason(&succeed(here, RUN)));
+    assert_eq!(decisions(), before);
+    let versions = json(here, ["versions", "."]);
+    assert_eq!((&versions["in_force"], &versions["not_taken_up"]), (&0.into(), &1.into()), "{versions}");
+    assert_eq!(states(&outcome(here)), [(1, "registered")]);
+}
+
+const OFTEN: &str = r#"
+[refit]
+replay = ["replay.extxyz"]
+after_structures = 2
+max_versions = 1
+held_out = 0.0
+method = { native = { epochs = 1, validation_share = 0.0 } }
+"#;
+
+/// Gives structures with a vacancy an energy that nothing explains.
+const LABEL: &str = r#"
+awk '
+    NR == 1 { energy = $1 == 47 ? -1e9 : -1.5; print; next }
+    NR == 2 { sub(/Properties=[^ ]*/, "Properties=species:S:1:pos:R:3:forces:R:3"); print $0 " energy=" energy; next }
+    { print $0, 0.25, 0, 0 }
+' structure.extxyz > unfinished
+mv unfinished label.extxyz
+"#;
+
+#[test]
+fn a_campaign_goes_on_with_its_version_when_labels_give_no_other() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let small = Small { max_per_walk: 3, refit: OFTEN, ..Small::default() };
+    let keys = "[label]\nmax_energy_per_atom = 1e8\nmax_energy_difference_per_atom = 1e8\n";
+    let method =
+        r#"method = { command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } } # "#;
+    let text = small.text().replacen("[label]\nmethod = ", &format!("{keys}{method}"), 1);
+    fs::write(small.write(here), text).unwrap();
+    fs::write(here.join("label.sh"), LABEL).unwrap();
+    let summary = succeed(here, RUN);
+    let outcome = outcome(here);
+    assert_eq!(states(&outcome), [(1, "refused"), (2, "refused"), (3, "refused")], "{summary}");
+    for version in &outcome.versions {
+        let reason = &version.reason;
+        assert!(reason.starts_with("train.extxyz:1 (candidate "), "{reason}");
+        assert!(reason.contains("): the energy differs from the model's by -2.1277e7 eV/atom"), "{reason}");
+        assert!(summary.contains(reason.as_str()), "{summary}");
+    }
+    // The walks go on after each of them.
+    let [first, .., last] = &outcome.versions[..] else { panic!("three attempts") };
+    assert!(last.structures > first.structures && last.last_decision > first.last_decision);
+    let taken_up = on_store(here.into(), async |store| store.decisions_of_kind("version").await.unwrap());
+    assert_eq!(taken_up, []);
+    assert_eq!(json(here, ["versions", "."])["in_force"], 0);
+}
