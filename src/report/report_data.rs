@@ -107,7 +107,7 @@ impl ProtocolLabels {
             statistics: label_statistics::read(store, hash, Some(version)).await?,
             costs: store.label_costs(hash, MAX_COSTS).await?,
             failures: store.failures(hash).await?,
-            unlabelled: store.unlabelled(hash, true).await?,
+            unlabelled: store.unlabelled(hash, version, true).await?,
             protocol,
         })
     }
