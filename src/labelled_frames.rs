@@ -33,6 +33,11 @@ pub struct DataFile {
 }
 
 impl DataFile {
+    /// As a file that was named for validation.
+    pub fn for_validation(self) -> Self {
+        Self { validation: true, ..self }
+    }
+
     /// The same without the directory of the file.
     pub fn without_directory(self) -> Self {
         let name = Path::new(&self.file).file_name();
@@ -70,10 +75,9 @@ pub type ReadFrames = (Vec<LabelledFrame>, Vec<DataFile>);
 /// A structure that cannot be read; labels that [`LabelledFrame::new`] refuses.
 pub fn read_frames(
     files: &StructureFiles,
-    validation: bool,
     stop: &CancellationToken,
 ) -> Result<Option<ReadFrames>, CommandError> {
-    let Some((read, stresses_left_out)) = read_without_warning(files, validation, stop)? else {
+    let Some((read, stresses_left_out)) = read_without_warning(files, stop)? else {
         return Ok(None);
     };
     if stresses_left_out > 0 {
@@ -88,7 +92,6 @@ pub fn read_frames(
 /// The same, with the number of stresses that are left out instead of the warning.
 pub fn read_without_warning(
     files: &StructureFiles,
-    validation: bool,
     stop: &CancellationToken,
 ) -> Result<Option<(ReadFrames, u64)>, CommandError> {
     let mut reader = files.reader(Arc::default());
@@ -108,7 +111,7 @@ pub fn read_without_warning(
             CommandError::Input(format!("{}: cannot be read: {error}", file.path.display()))
         })?;
         let name = file.path.display().to_string();
-        Ok(DataFile { file: name, hash, structures, weight: file.weight, validation })
+        Ok(DataFile { file: name, hash, structures, weight: file.weight, validation: false })
     };
     let sources = files.files.iter().zip(counts).map(file).collect::<Result<_, _>>()?;
     Ok(Some(((frames, sources), stresses_left_out)))

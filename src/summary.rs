@@ -5,7 +5,7 @@ use std::fmt;
 use calm::forgetting::GradeDistribution;
 use monitor::end_reason::CampaignEnd;
 use monitor::label_statistics::{self, ErrorsByGrade, LabelStatistics};
-use monitor::versions::CampaignVersions;
+use monitor::versions::{CampaignVersions, newest_with_labels};
 use monitor::walk_ends::WalkEnds;
 use store::{CampaignStatus, Store, StoreError, Unlabelled};
 use wire::ContentHash;
@@ -36,7 +36,8 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<Summary, Store
     let status = store.status().await?;
     let end = CampaignEnd::read(store, &status).await?;
     let statistics = label_statistics::read(store, protocol, None).await?;
-    let unlabelled = store.unlabelled(protocol, true).await?;
+    let version = newest_with_labels(store, protocol, &store.walk_versions().await?).await?;
+    let unlabelled = store.unlabelled(protocol, version, true).await?;
     let values = store.values().await?;
     let watched = values.iter().find(|(name, _)| name == "training_frames");
     let watched: Option<GradeDistribution> = watched.and_then(|(_, text)| serde_json::from_str(text).ok());

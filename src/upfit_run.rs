@@ -25,13 +25,13 @@ pub struct UpfitRun {
     pub settings: UpfitSettings,
     /// File for the new model.
     pub output: PathBuf,
-    /// File of the state, which is removed at the end.
+    /// File of the state. It remains until [`remove_checkpoint`].
     pub checkpoint: PathBuf,
 }
 
 impl UpfitRun {
-    /// Trains, or continues from the state, and writes the model; before that calls `finish`, and then removes the state. `None` if
-    /// `stop` was cancelled; the same training continues later.
+    /// Trains, or continues from the state, and writes the model; before that calls `finish`. `None` if `stop` was cancelled; the same
+    /// training continues later. As long as the state is there, a training that has ended gives the same model again at once.
     ///
     /// # Errors
     /// Those of [`upfit::run`], as `to_error` makes them; a file that cannot be written; `finish`'s.
@@ -49,13 +49,15 @@ impl UpfitRun {
         let Some(outcome) = trained.map_err(to_error)? else { return Ok(None) };
         finish(&outcome)?;
         write_model(&outcome.model, &output, &note.to_string())?;
-        // Without the model, the checkpoint would be needed.
-        match fs::remove_file(&checkpoint) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => {
-                Err(cannot_write(&checkpoint, error).into())
-            }
-            _ => Ok(Some(outcome)),
-        }
+        Ok(Some(outcome))
+    }
+}
+
+/// Removes the state of a training whose model, and what else comes of it, is in its files.
+pub fn remove_checkpoint(checkpoint: &Path) -> Result<(), CommandError> {
+    match fs::remove_file(checkpoint) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(cannot_write(checkpoint, error)),
+        _ => Ok(()),
     }
 }
 

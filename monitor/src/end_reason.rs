@@ -52,28 +52,56 @@ impl CampaignEnd {
         if !status.finished {
             return None;
         }
+        // A budget of time allows no refit either; one of structures does.
+        let may_refit = status.budget.limits.time_used_up(&status.budget.used).is_none();
+        if may_refit && is_refit_left(configuration, versions, status.candidates.accepted) {
+            return None;
+        }
         if let Some(key) = &status.budget.used_up {
             return Some(Self::Budget { key: key.clone() });
         }
-        let stop = &configuration["stop"];
-        let max_versions = configuration["refit"]["max_versions"].as_u64();
-        if let Some((found, least)) = Improvement::of_newest(versions).zip(stop["min_improvement"].as_f64())
-            && found.per_100_labels() < least
-        {
+        if let Some(found) = small_improvement(configuration, versions) {
             let improvement = found.per_100_labels();
             return Some(Self::SmallImprovement { version: found.version, improvement });
         }
-        let trained = trained_versions(versions).count() as u64;
-        let before = versions.iter().map(|version| version.structures).max().unwrap_or(0);
-        if max_versions.is_some_and(|most| trained < most) && status.candidates.accepted > before {
-            return None;
-        }
         if found_nothing_new(status) {
-            return Some(Self::NothingNew { steps: stop["max_steps_without_structure"].as_u64() });
+            let steps = configuration["stop"]["max_steps_without_structure"].as_u64();
+            return Some(Self::NothingNew { steps });
         }
-        let all = max_versions.filter(|most| trained >= *most);
+        let trained = trained_versions(versions).count() as u64;
+        let all = max_versions(configuration).filter(|most| trained >= *most);
         Some(all.map_or(Self::AllWalks, |_| Self::AllVersions { versions: trained }))
     }
+}
+
+/// Whether a version of the potential is left to train when all walks have ended, after which walks go on.
+pub async fn is_refit_due(store: &Store) -> Result<bool, StoreError> {
+    let configuration = store.campaign().await?.configuration_in_force;
+    let configuration = serde_json::from_str(&configuration).unwrap_or_default();
+    if max_versions(&configuration).is_none() {
+        return Ok(false);
+    }
+    let accepted = store.accepted_structures().await?;
+    Ok(is_refit_left(&configuration, &store.versions().await?, accepted))
+}
+
+fn is_refit_left(configuration: &Value, versions: &[VersionRecord], accepted: u64) -> bool {
+    let trained = trained_versions(versions).count() as u64;
+    let before = versions.iter().map(|version| version.structures).max().unwrap_or(0);
+    max_versions(configuration).is_some_and(|most| trained < most)
+        && accepted > before
+        && small_improvement(configuration, versions).is_none()
+}
+
+/// `refit.max_versions`; `None` without a refit.
+fn max_versions(configuration: &Value) -> Option<u64> {
+    configuration["refit"]["max_versions"].as_u64()
+}
+
+/// The improvement of the newest version if it is below `stop.min_improvement`.
+fn small_improvement(configuration: &Value, versions: &[VersionRecord]) -> Option<Improvement> {
+    let least = configuration["stop"]["min_improvement"].as_f64()?;
+    Improvement::of_newest(versions).filter(|found| found.per_100_labels() < least)
 }
 
 /// Whether biased walks of the newest version of the potential ended because they found nothing new.
@@ -87,7 +115,7 @@ fn found_nothing_new(status: &CampaignStatus) -> bool {
 #[cfg(test)]
 mod tests {
     use serde_json::json;
-    use store::{BudgetStatus, Candidates, WalkStatus};
+    use store::{Budget, BudgetStatus, Candidates, WalkStatus};
     use wire::WalkConditions;
 
     use super::*;
@@ -142,6 +170,14 @@ mod tests {
             "nothing new since the last version"
         );
         assert_eq!(found(None, 3, &versions[..1]), None, "another version will be trained");
+        let used_up = |limits| {
+            let budget = BudgetStatus { used_up: Some("budget.x".into()), limits, ..BudgetStatus::default() };
+            let status = CampaignStatus { budget, ..status.clone() };
+            CampaignEnd::find(&status, &configuration(None, 3), &versions[..1])
+        };
+        assert_eq!(used_up(Budget::default()), None, "another version follows a budget of structures");
+        let no_time = Budget { wall_hours: Some(0.0), ..Budget::default() };
+        assert_eq!(used_up(no_time), Some(CampaignEnd::Budget { key: "budget.x".into() }));
         let Some(CampaignEnd::SmallImprovement { version, improvement }) = found(Some(0.05), 3, &versions)
         else {
             panic!("it improved by 4 %");

@@ -4,6 +4,7 @@ use serde_json::{Value, json};
 use store::{CampaignStatus, FailureCount, JobState, Store, StoreError, Unlabelled};
 
 use crate::label_cost::{self, QueueCost};
+use crate::versions::newest_with_labels;
 
 /// Largest number of labelled structures for which ranges of grades and volumes are computed.
 const MAX_STRUCTURES: u64 = 20_000;
@@ -46,7 +47,10 @@ impl LabelQueue {
         };
         let unlabelled = match (status.labels.failed, status.labels.labelled) {
             (0, _) => Vec::new(),
-            (_, labelled) => store.unlabelled(protocol.hash, labelled <= MAX_STRUCTURES).await?,
+            (_, labelled) => {
+                let version = newest_with_labels(store, protocol.hash, &store.walk_versions().await?).await?;
+                store.unlabelled(protocol.hash, version, labelled <= MAX_STRUCTURES).await?
+            }
         };
         Ok(Self {
             cost: label_cost::queue_cost(store, protocol.hash).await?,

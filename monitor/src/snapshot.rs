@@ -46,12 +46,15 @@ impl Snapshot {
     pub async fn read(store: &Store) -> Result<Self, StoreError> {
         let forecast = store.metadata(disk::METADATA_KEY).await?;
         let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
-        let (campaign, status) = (store.campaign().await?, store.status().await?);
+        let (campaign, mut status) = (store.campaign().await?, store.status().await?);
+        let end_reason = CampaignEnd::read(store, &status).await?;
+        // A refit may be left although every walk has ended.
+        status.finished = end_reason.is_some();
         let labels = LabelQueue::read(store, &status).await?;
         let values = store.values().await?;
         let configuration: Value = serde_json::from_str(&campaign.configuration_in_force).unwrap_or_default();
         Ok(Self {
-            end_reason: CampaignEnd::read(store, &status).await?,
+            end_reason,
             end: ExpectedEnd::extrapolate(&status, &configuration, &labels.cost),
             origin: Provenance::read(store).await?,
             check: ReferenceCheck::read(store).await?,

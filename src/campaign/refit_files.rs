@@ -45,7 +45,7 @@ impl Loader<'_> {
     ) -> Result<(), ConfigError> {
         let wrong = |message: String| self.file_error(key, file, message);
         let files = StructureReadingArgs::default().files(std::slice::from_ref(file.get_ref()));
-        let frames = files.and_then(|files| read_without_warning(&files, true, &CancellationToken::new()));
+        let frames = files.and_then(|files| read_without_warning(&files, &CancellationToken::new()));
         let ((frames, _), _) = frames.map_err(|error| wrong(error.to_string()))?.unwrap_or_default();
         if frames.is_empty() {
             return Err(wrong(format!("{}: no structures", file.get_ref().display())));

@@ -32,6 +32,7 @@ use crate::duration::Duration;
 use crate::forgetting::{ForgettingMeasurement, ForgettingRule};
 use crate::label_setup::LABEL_METHOD_KEY;
 use crate::output::{log_and_print, log_and_warn, print, warn_if_unencrypted};
+use crate::refit::schedule::RefitSchedule;
 use crate::runtime::notify::{self, Notifier};
 use crate::runtime::reference_check::{self, ANY_CHECK};
 use crate::runtime::{self, time_budget, version_loop};
@@ -190,6 +191,10 @@ async fn run(
     let versioned = version_loop::in_force(campaign, &store, directory).await?;
     let campaign = &versioned;
     let selector = version_loop::restore_selector(campaign, &store).await?;
+    let schedule = RefitSchedule::read(&store, &campaign.config).await?;
+    if let Some(why) = schedule.why_no_walk_starts().filter(|_| selector.is_done()) {
+        log_and_print(why);
+    }
     let pauses = campaign.config.calm.on_forgetting == OnForgetting::Pause;
     if pauses && selector.forgetting_level() > 1.0 && !selector.is_done() {
         return Err(paused_by_alarm(campaign, &store).await?);
@@ -218,7 +223,7 @@ async fn run(
     // A refit may be left although every walk has ended, unless a budget of time allows no further work.
     let may_refit = campaign.config.refit.is_some()
         && outcome == reactor::RunOutcome::Stopped
-        && status.budget.used_up.is_none();
+        && status.budget.limits.time_used_up(&status.budget.used).is_none();
     if may_refit || !status.finished {
         if pauses && MixtureValues(store.values().await?).training_frames()["alarm"] == true {
             return Err(paused_by_alarm(campaign, &store).await?);

@@ -36,6 +36,18 @@ pub use self::workers::PassContext;
 use crate::exit_status::CommandError;
 use crate::output::print_stderr;
 
+/// The defaults of a build, by `calmwalk calm build` and by a refit.
+pub struct BuildDefaults;
+
+impl BuildDefaults {
+    /// Candidate numbers of components for each element.
+    pub const CANDIDATES: [usize; 5] = [1, 2, 4, 8, 16];
+    /// Structures in a shard.
+    pub const SHARD_SIZE: u64 = 1000;
+    /// Disk space for features, bytes.
+    pub const MAX_FEATURE_BYTES: u64 = 4_000_000_000;
+}
+
 /// A build under way.
 pub struct MixtureBuild {
     context: PassContext,

@@ -101,7 +101,7 @@ impl DataSets {
         stop: &CancellationToken,
     ) -> Result<Option<Self>, RefitFailure> {
         let read = |paths: &[PathBuf]| -> Result<Vec<LabelledFrame>, CommandError> {
-            let found = read_without_warning(&StructureReadingArgs::default().files(paths)?, true, stop)?;
+            let found = read_without_warning(&StructureReadingArgs::default().files(paths)?, stop)?;
             Ok(found.map(|((frames, _), _)| frames).unwrap_or_default())
         };
         let mut sets = Vec::new();

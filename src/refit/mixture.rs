@@ -16,16 +16,9 @@ use crate::artifact_checks::check_sound;
 use crate::exit_status::CommandError;
 use crate::feature_variant::{FeatureModel, with_projection};
 use crate::file_hash;
-use crate::mixture_build::{MixtureBuild, PROJECTED, PassContext, projected};
+use crate::mixture_build::{BuildDefaults, MixtureBuild, PROJECTED, PassContext, projected};
 use crate::mixture_files::{MixtureFiles, write_beside};
 use crate::unlabelled_updates;
-
-/// Candidate numbers of components for each element, as `calmwalk calm build` has them.
-const CANDIDATES: [usize; 5] = [1, 2, 4, 8, 16];
-/// Structures in a shard.
-const SHARD_SIZE: u64 = 1000;
-/// Disk space for features, bytes.
-const MAX_FEATURE_BYTES: u64 = 4_000_000_000;
 
 /// Builds the mixture of a model from the replay data and the labels that it was trained on, and updates it with the accepted
 /// candidates that are not among them. `None` after a cancellation of `stop`.
@@ -43,8 +36,8 @@ pub async fn build(
     let settings = BuildSettings {
         dimension: projection.feature_dimension,
         seed: config.rng_seed,
-        candidates: CANDIDATES.to_vec(),
-        shard_size: SHARD_SIZE,
+        candidates: BuildDefaults::CANDIDATES.to_vec(),
+        shard_size: BuildDefaults::SHARD_SIZE,
     };
     // The weight of replay data in the training is none of the mixture: its structures stand for those that they were drawn from.
     let mut data = files(&config.settings, labels)?;
@@ -52,11 +45,11 @@ pub async fn build(
     let context = PassContext {
         model: found.clone(),
         files: data,
-        shard_size: SHARD_SIZE,
+        shard_size: BuildDefaults::SHARD_SIZE,
         part: None,
         seed: config.rng_seed,
         threads: config.settings.threads(),
-        max_feature_bytes: MAX_FEATURE_BYTES,
+        max_feature_bytes: BuildDefaults::MAX_FEATURE_BYTES,
         stop: stop.clone(),
     };
     let hash = file_hash::hash(model_file).map_err(CommandError::failed)?;

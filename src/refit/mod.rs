@@ -47,6 +47,8 @@ const LOCK: &str = "refit.lock";
 /// The new model and its mixture.
 const MODEL: &str = command::MODEL;
 const MIXTURE: &str = "mixture.npz";
+/// Why a refit without any label to train on is refused.
+const NO_LABELS: &str = "there are no labels to train on";
 /// Name of the comparison with control frames.
 const CONTROL: &str = "control";
 
@@ -208,7 +210,7 @@ impl Refit<'_> {
     /// version that is refused gets no mixture.
     async fn train_and_judge(&self) -> Result<Option<(Option<String>, Value)>, RefitFailure> {
         let Some(labels) = self.labels.path(&self.directory, LabelFile::Training) else {
-            return Err(RefitFailure::refused("there are no labels to train on"));
+            return Err(RefitFailure::refused(NO_LABELS));
         };
         let training = kept(self.directory.join("training.json"), || self.train(&labels));
         let Some(training) = training.await? else { return Ok(None) };

@@ -51,7 +51,7 @@ impl NativeTraining<'_> {
         let (begin, name) = self.begin;
         let model = TrainableGrace::load(&begin.path).map_err(RefitFailure::refused)?;
         let files = files(settings, self.labels)?;
-        let read = read_frames(&files, false, stop).map_err(RefitFailure::of_input)?;
+        let read = read_frames(&files, stop).map_err(RefitFailure::of_input)?;
         let Some((frames, sources)) = read else { return Ok(None) };
         let data = upfit::split(frames, native.validation_share, rng_seed);
         let data = data.map_err(RefitFailure::of_training)?;

@@ -5,6 +5,8 @@ use monitor::improvement::{Improvement, trained_versions};
 use orchestrator::selector::VERSION;
 use store::{Store, StoreError, VersionRecord, VersionState};
 
+use super::NO_LABELS;
+use super::training_set::has_label_to_train_on;
 use crate::config::{Config, RefitSection};
 
 /// What the times of refits follow from.
@@ -20,6 +22,8 @@ pub struct RefitSchedule {
     pub min_improvement: Option<f64>,
     /// See [`RefitSection::max_versions`]; 0 without a refit.
     pub max_versions: usize,
+    /// The last attempts were refused because there was no label to train on, and there is one now: they do not count.
+    pub labels_came_late: bool,
 }
 
 impl RefitSchedule {
@@ -27,8 +31,17 @@ impl RefitSchedule {
     pub async fn read(store: &Store, config: &Config) -> Result<Self, StoreError> {
         let values = store.values().await?;
         let taken_up = values.iter().find(|(name, _)| name == VERSION);
+        let versions = store.versions().await?;
+        let labels_came_late = match &config.refit {
+            Some(refit) if versions.last().is_some_and(had_no_labels) => {
+                let settings = (refit.held_out, refit.control_frames);
+                has_label_to_train_on(store, settings, config.campaign.rng_seed).await?
+            }
+            _ => false,
+        };
         Ok(Self {
-            versions: store.versions().await?,
+            versions,
+            labels_came_late,
             accepted: store.accepted_structures().await?,
             taken_up: taken_up.and_then(|(_, number)| number.parse().ok()).unwrap_or(0),
             min_improvement: config.stop.min_improvement.map(Positive::get),
@@ -68,19 +81,40 @@ impl RefitSchedule {
     /// Whether the campaign ends with the newest version: no walk starts with it, unless some have before that was known.
     pub fn is_newest_without_walks(&self) -> bool {
         let is_last = |newest: &VersionRecord| {
-            newest.method != VersionRecord::ROLLBACK && (self.is_converged() || self.are_all_trained())
+            newest.is_of_training() && (self.is_converged() || self.are_all_trained())
         };
         self.newest().is_some_and(|newest| newest.number > self.taken_up && is_last(newest))
     }
 
+    /// Versions and refused attempts whose structures and time the next refit counts from.
+    fn attempts(&self) -> impl Iterator<Item = &VersionRecord> {
+        let late = self.versions.iter().rev().take_while(|last| self.labels_came_late && had_no_labels(last));
+        self.versions.iter().take(self.versions.len() - late.count())
+    }
+
     /// Number of accepted structures at the last attempt.
     fn accepted_before(&self) -> u64 {
-        self.versions.iter().map(|version| version.structures).max().unwrap_or(0)
+        self.attempts().map(|version| version.structures).max().unwrap_or(0)
     }
 
     /// Whether the campaign trains further versions.
     fn trains_more(&self) -> bool {
         !self.is_converged() && !self.are_all_trained()
+    }
+
+    /// Why no walk starts although limits of walks may have been raised: the campaign ended with a version that no walk has. `None` if
+    /// it has not.
+    pub fn why_no_walk_starts(&self) -> Option<String> {
+        let newest = self.newest().filter(|_| self.is_newest_without_walks())?;
+        let (key, change) = match self.is_converged() {
+            true => ("stop.min_improvement", "lower"),
+            false => ("refit.max_versions", "raise"),
+        };
+        Some(format!(
+            "no walk starts: the campaign ended with version {}, the last one by {key}; {change} {key} to start all walks of the plan \
+             with that version (raised limits of walks alone start none)",
+            newest.number
+        ))
     }
 
     /// Number of accepted structures at which biased walks end for the next version. Those that ended for the last one
@@ -105,11 +139,16 @@ impl RefitSchedule {
 
     /// Whether a refit is due beside the walks of a live campaign, which began at `begin`; both times in ms since 1970.
     pub fn is_due_beside_walks(&self, refit: &RefitSection, begin: i64, now: i64) -> bool {
-        let last = self.versions.iter().map(|version| version.time).max().unwrap_or(begin);
+        let last = self.attempts().map(|version| version.time).max().unwrap_or(begin);
         let by_time = refit.after_time.is_some_and(|time| now - last >= (1000.0 * time.seconds()) as i64);
         let by_structures = self.refit_at(refit).is_some_and(|number| self.accepted >= number);
         self.is_due_after_walks() && (by_time || by_structures)
     }
+}
+
+/// Whether an attempt was refused because there was no label to train on.
+fn had_no_labels(attempt: &VersionRecord) -> bool {
+    attempt.state == VersionState::Refused && attempt.reason == NO_LABELS
 }
 
 #[cfg(test)]
@@ -188,6 +227,7 @@ mod tests {
             taken_up: 1,
             min_improvement: Some(0.15),
             max_versions: 9,
+            labels_came_late: false,
         };
         let in_force = |schedule: &RefitSchedule| schedule.in_force().map_or(0, |version| version.number);
         assert!(!schedule.is_converged() && schedule.is_due_after_walks());
@@ -223,16 +263,47 @@ mod tests {
         schedule.versions.push(version(2, VersionState::Registered, 9));
         assert!(!schedule.is_due_after_walks() && schedule.is_newest_without_walks());
         assert_eq!((schedule.in_force().unwrap().number, schedule.refit_at(&refit)), (1, Some(0)));
+        let why = schedule.why_no_walk_starts().unwrap();
+        assert!(why.contains("version 2") && why.contains("raise refit.max_versions"), "{why}");
         // With a larger limit it goes on with that version.
         schedule.max_versions = 3;
         assert!(!schedule.is_due_after_walks() && !schedule.is_newest_without_walks());
         assert_eq!((schedule.in_force().unwrap().number, schedule.refit_at(&refit)), (2, Some(14)));
+        assert_eq!(schedule.why_no_walk_starts(), None);
         // Walks of a version that the user rolls back to are wanted.
         let method = VersionRecord::ROLLBACK.into();
         schedule.versions.push(VersionRecord { method, ..version(3, VersionState::Registered, 9) });
         schedule.max_versions = 2;
         assert!(!schedule.is_newest_without_walks());
         assert_eq!(schedule.in_force().unwrap().number, 3);
+    }
+
+    /// A structure whose label came too late for an attempt is trained on by the next one.
+    #[test]
+    fn attempts_without_labels_do_not_count_once_there_are_labels() {
+        let refit = section("after_structures = 5\nafter_time = \"20s\"");
+        let no_labels = |number| VersionRecord {
+            reason: NO_LABELS.into(),
+            ..version(number, VersionState::Refused, 4 + u64::from(number))
+        };
+        let mut schedule = RefitSchedule {
+            versions: vec![version(1, VersionState::Refused, 1), no_labels(2), no_labels(3)],
+            accepted: 7,
+            max_versions: 2,
+            ..RefitSchedule::default()
+        };
+        assert_eq!(schedule.refit_at(&refit), Some(12));
+        assert!(!schedule.has_news() && !schedule.is_due_beside_walks(&refit, 0, i64::MAX));
+        schedule.labels_came_late = true;
+        assert_eq!(schedule.refit_at(&refit), Some(6));
+        assert!(schedule.is_due_after_walks() && schedule.is_due_beside_walks(&refit, 0, 10_000));
+        // With too few structures, by the time since the attempt before.
+        schedule.accepted = 5;
+        assert!(!schedule.is_due_beside_walks(&refit, 0, 29_999));
+        assert!(schedule.is_due_beside_walks(&refit, 0, 30_000));
+        // Only the last ones are left out: what came between is trained on already.
+        schedule.versions.push(version(4, VersionState::Registered, 5));
+        assert!(!schedule.has_news());
     }
 
     #[test]

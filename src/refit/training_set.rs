@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use atoms::extxyz::{ExtxyzWriteError, LabelKeys, write_frame};
 use serde::{Deserialize, Serialize};
-use store::{ExportCursor, ExportFilter, ExportRow, ExportSource, Store};
+use store::{ExportCursor, ExportFilter, ExportRow, ExportSource, Store, StoreError};
 use tokio_util::sync::CancellationToken;
 use wire::{Origin, WalkConditions, WalkId};
 
@@ -95,14 +95,35 @@ pub fn is_held_out(seed_structure: &str, rng_seed: u64, share: f64) -> bool {
     (number as f64) / ((1_u64 << 53) as f64) < share
 }
 
+/// Whether the campaign has any label that a refit trains on now. Reads labels until it finds one.
+pub async fn has_label_to_train_on(
+    store: &Store,
+    (held_out, control_frames): (f64, ControlFrames),
+    rng_seed: u64,
+) -> Result<bool, StoreError> {
+    let Some(protocol) = store.protocol_in_force().await? else { return Ok(false) };
+    let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: true };
+    let sorter = Sorter { held_out, control_frames, rng_seed, last_decision: i64::MAX };
+    let mut last = None;
+    loop {
+        let page = store.labelled(&filter, last, PAGE).await?;
+        let Some(end) = page.last() else { return Ok(false) };
+        last = Some(end.cursor);
+        if page.iter().any(|row| sorter.file(row, false) == Some(LabelFile::Training)) {
+            return Ok(true);
+        }
+    }
+}
+
 /// Where each label belongs.
-struct Sorter<'a> {
-    settings: &'a RefitSettings,
+struct Sorter {
+    held_out: f64,
+    control_frames: ControlFrames,
     rng_seed: u64,
     last_decision: i64,
 }
 
-impl Sorter<'_> {
+impl Sorter {
     /// The file of a row. `after`: labels after the last decision, otherwise those before.
     fn file(&self, row: &ExportRow, after: bool) -> Option<LabelFile> {
         let ExportSource::Candidate { seed_structure_name, origin, .. } = &row.source else {
@@ -110,13 +131,11 @@ impl Sorter<'_> {
         };
         let is_after =
             matches!(row.cursor, ExportCursor::Candidate(decision) if decision > self.last_decision);
-        let is_held_out = is_held_out(seed_structure_name, self.rng_seed, self.settings.held_out);
+        let is_held_out = is_held_out(seed_structure_name, self.rng_seed, self.held_out);
         match (is_after, after) {
             (true, true) => Some(LabelFile::Since),
             (false, false) if is_held_out => Some(LabelFile::HeldOut),
-            (false, false)
-                if *origin == Origin::Control && self.settings.control_frames == ControlFrames::Compare =>
-            {
+            (false, false) if *origin == Origin::Control && self.control_frames == ControlFrames::Compare => {
                 Some(LabelFile::Control)
             }
             (false, false) => Some(LabelFile::Training),
@@ -139,7 +158,8 @@ pub async fn write(
     let mut found = LabelFiles::default();
     let Some(protocol) = store.protocol_in_force().await? else { return Ok(Some(found)) };
     let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: true };
-    let sorter = Sorter { settings, rng_seed, last_decision: set.last_decision };
+    let RefitSettings { held_out, control_frames, .. } = *settings;
+    let sorter = Sorter { held_out, control_frames, rng_seed, last_decision: set.last_decision };
     let (campaign, conditions) = (store.campaign().await?.id.to_string(), store.walk_conditions().await?);
     let mut files = BTreeMap::new();
     let mut last = None;

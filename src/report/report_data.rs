@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use monitor::end_reason::CampaignEnd;
 use monitor::label_statistics::comparison::WalkComparison;
 use monitor::label_statistics::{self, LabelStatistics};
 use monitor::versions::{CampaignVersions, newest_with_labels};
@@ -69,7 +70,8 @@ impl ReportData {
         let protocol = store.protocol_in_force().await?;
         let decisions = store.newest_mixture().await?.decision;
         let part = u32::try_from(decisions.max(1).unsigned_abs().div_ceil(MAX_PARTS)).unwrap_or(u32::MAX);
-        let (status, values) = (store.status().await?, store.values().await?);
+        let (mut status, values) = (store.status().await?, store.values().await?);
+        status.finished = CampaignEnd::read(store, &status).await?.is_some();
         let versions = CampaignVersions::read(store, &status, &values).await?;
         let values =
             values.into_iter().filter_map(|(name, text)| Some((name, serde_json::from_str(&text).ok()?)));
@@ -110,7 +112,7 @@ impl ProtocolLabels {
             statistics,
             costs: store.label_costs(hash, MAX_COSTS).await?,
             failures: store.failures(hash).await?,
-            unlabelled: store.unlabelled(hash, true).await?,
+            unlabelled: store.unlabelled(hash, version, true).await?,
             protocol,
         })
     }

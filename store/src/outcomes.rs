@@ -92,7 +92,8 @@ pub struct Unlabelled {
     pub failed: u64,
     /// Structures that have their label.
     pub labelled: u64,
-    /// Range of the largest γ of the failed ones, under the original mixture.
+    /// Range of the largest γ of the failed ones that walks with one version of the potential found, under its original
+    /// mixture.
     pub gamma: ValueRange,
     /// The same for the labelled ones.
     pub gamma_labelled: ValueRange,

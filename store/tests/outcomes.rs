@@ -95,7 +95,7 @@ async fn imported_structures_count_as_others_do() {
     let newest = store.label_costs(dft, 1).await.unwrap().remove(0);
     assert_eq!((newest.seed_structure, newest.atoms, newest.core_seconds), (u32::MAX, 2, 6.0));
     for ranges in [true, false] {
-        let unlabelled = store.unlabelled(dft, ranges).await.unwrap();
+        let unlabelled = store.unlabelled(dft, 0, ranges).await.unwrap();
         let rows: Vec<_> =
             unlabelled.iter().map(|row| (row.seed_structure.as_str(), row.failed, row.labelled)).collect();
         assert_eq!(rows, [("diamond", 2, 3), ("imported", 1, 1)], "ranges: {ranges}");
@@ -136,20 +136,27 @@ async fn failures_are_counted_by_class_and_outcome() {
 async fn failed_labels_are_grouped_by_seed_structure_and_formula() {
     let database = TestDatabase::new();
     let (store, names) = filled(&database).await;
-    let unlabelled = store.unlabelled(protocol("dft").hash, true).await.unwrap();
+    let unlabelled = store.unlabelled(protocol("dft").hash, 0, true).await.unwrap();
     let without = |part: &Unlabelled| Unlabelled {
         gamma_labelled: ValueRange::default(),
         relative_volume_labelled: ValueRange::default(),
         ..part.clone()
     };
     let expected: Vec<_> = unlabelled.iter().map(without).collect();
-    assert_eq!(store.unlabelled(protocol("dft").hash, false).await.unwrap(), expected);
+    assert_eq!(store.unlabelled(protocol("dft").hash, 0, false).await.unwrap(), expected);
     let [only] = unlabelled.as_slice() else { panic!("{unlabelled:?}") };
     assert_eq!((only.seed_structure.as_str(), only.formula.as_str()), ("diamond", "Si2"));
     assert_eq!((only.failed, only.labelled), (2, 3));
     let range = |low, high| ValueRange { low: Some(low), high: Some(high) };
     assert_eq!((only.gamma, only.gamma_labelled), (range(3.0, 4.0), range(1.5, 1.7)));
     assert_eq!((only.relative_volume, only.relative_volume_labelled), (range(1.35, 1.4), range(1.0, 1.2)));
+    // No walk has this version of the potential, so there are no grades to compare; all else is of all versions.
+    for ranges in [true, false] {
+        let other = store.unlabelled(protocol("dft").hash, 7, ranges).await.unwrap().remove(0);
+        let none = ValueRange::default();
+        assert_eq!((other.gamma, other.gamma_labelled), (none, none));
+        assert_eq!((other.failed, other.labelled, other.relative_volume), (2, 3, range(1.35, 1.4)));
+    }
 
     // In pages of any length.
     let (mut after, mut jobs) = (0, Vec::new());
@@ -177,8 +184,8 @@ async fn failed_labels_are_grouped_by_seed_structure_and_formula() {
     // A protocol without jobs has no results.
     store.add_protocol(&protocol("other"), 0).await.unwrap();
     assert!(store.finished(protocol("other").hash, 0, 9).await.unwrap().is_empty());
-    assert!(store.unlabelled(protocol("other").hash, true).await.unwrap().is_empty());
-    assert!(store.unlabelled(ContentHash([9; 32]), true).await.is_err());
+    assert!(store.unlabelled(protocol("other").hash, 0, true).await.unwrap().is_empty());
+    assert!(store.unlabelled(ContentHash([9; 32]), 0, true).await.is_err());
 }
 
 #[tokio::test]

@@ -62,9 +62,8 @@ pub fn run(
         trainer.train_epoch(&mut state, &mut on_event)?;
     }
     let after = if stop() { None } else { trainer.errors_of_chosen(&state)? };
-    if after.is_none() {
-        trainer.save(&state)?;
-    }
+    // Also at the end: whoever is killed before the model is in its file trains nothing again.
+    trainer.save(&state)?;
     Ok(after.map(|after| trainer.finish(state, after)))
 }
 

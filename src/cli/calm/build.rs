@@ -14,7 +14,7 @@ use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::{FeatureModel, FeatureVariant};
 use crate::file_hash;
-use crate::mixture_build::{BuildPart, MixtureBuild, PROJECTED, PassContext, projected};
+use crate::mixture_build::{BuildDefaults, BuildPart, MixtureBuild, PROJECTED, PassContext, projected};
 use crate::mixture_files::MixtureFiles;
 use crate::output::{TextTable, log_and_warn, print, print_stderr};
 use crate::signals::stop_token;
@@ -57,7 +57,7 @@ pub struct CalmBuildArgs {
     #[arg(long, value_name = "DIR", conflicts_with = "pass")]
     campaign: Option<PathBuf>,
     /// Candidate numbers of components per element, ascending; the build chooses one for each element
-    #[arg(long, value_name = "K,…", value_delimiter = ',', default_values_t = [1, 2, 4, 8, 16])]
+    #[arg(long, value_name = "K,…", value_delimiter = ',', default_values_t = BuildDefaults::CANDIDATES)]
     candidates: Vec<usize>,
     /// Random seed
     #[arg(long, value_name = "N", default_value_t = 42)]
@@ -66,14 +66,14 @@ pub struct CalmBuildArgs {
     #[arg(long, value_name = "D", value_parser = clap::value_parser!(u32).range(1..=65536))]
     projection_dimension: Option<u32>,
     /// Number of structures per shard. Each thread keeps one shard in memory
-    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, value_name = "N", default_value_t = BuildDefaults::SHARD_SIZE, value_parser = clap::value_parser!(u64).range(1..))]
     shard_size: u64,
     /// Threads; each takes whole shards [default: all cores]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
     /// Disk space beside the output for features, GB: passes 2 and 3 read there what pass 1 computed, and compute what does not fit.
     /// With --part, the limit applies to each process. 0 keeps nothing
-    #[arg(long, value_name = "GB", default_value_t = 4.0, value_parser = gigabytes)]
+    #[arg(long, value_name = "GB", default_value_t = BuildDefaults::MAX_FEATURE_BYTES as f64 / 1e9, value_parser = gigabytes)]
     max_feature_cache: f64,
     /// Discard the saved state and start from pass 1
     #[arg(long)]

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use monitor::end_reason::CampaignEnd;
 use monitor::provenance::{self, ConfigMatch, Provenance};
 use serde_json::Value;
 use store::{Location, Store, unix_milliseconds};
@@ -94,7 +95,7 @@ async fn report_progress(
         )
     };
     let name = &origin.name;
-    match status.finished {
+    match CampaignEnd::read(store, &status).await?.is_some() {
         true => log_and_print(format_args!("campaign '{name}' in {location} is finished: {progress}")),
         false => log_and_print(format_args!("resuming campaign '{name}' in {location}: {progress}")),
     }

@@ -78,8 +78,9 @@ pub fn fine_tune(
         Some(path) => write_curves(path, outcome),
         None => Ok(()),
     };
-    let outcome = run.run(stop, &mut show, finish, command_error)?;
-    Ok(outcome.map(|outcome| FineTuned { outcome, note }))
+    let Some(outcome) = run.run(stop, &mut show, finish, command_error)? else { return Ok(None) };
+    upfit_run::remove_checkpoint(&request.checkpoint)?;
+    Ok(Some(FineTuned { outcome, note }))
 }
 
 /// Both sets, and the files that they come from; `None` if it was asked to stop.
@@ -88,12 +89,12 @@ fn read_data(
     stop: &CancellationToken,
 ) -> Result<Option<(TrainingData, Vec<DataFile>)>, CommandError> {
     let settings = &request.settings;
-    let Some((frames, mut sources)) = read_frames(&request.data, false, stop)? else { return Ok(None) };
+    let Some((frames, mut sources)) = read_frames(&request.data, stop)? else { return Ok(None) };
     let data = match &request.validation {
         None => ::upfit::split(frames, request.validation_share, settings.seed).map_err(command_error)?,
         Some(files) => {
-            let Some((validation, others)) = read_frames(files, true, stop)? else { return Ok(None) };
-            sources.extend(others);
+            let Some((validation, others)) = read_frames(files, stop)? else { return Ok(None) };
+            sources.extend(others.into_iter().map(DataFile::for_validation));
             TrainingData { training: frames, validation }
         }
     };

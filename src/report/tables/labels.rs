@@ -132,7 +132,8 @@ pub fn failures(failures: &[FailureCount]) -> PageTable {
 /// The part of the collected space without labels because of failures.
 pub fn unlabelled(unlabelled: &[Unlabelled]) -> PageTable {
     let caption = "Collected structures without a label because all attempts failed, by seed structure: ranges of the largest γ under the \
-                   original mixture and of V/V_{0}, compared with those of labelled structures.";
+                   original mixture (of the version of the potential that this report shows) and of V/V_{0}, compared with those \
+                   of labelled structures.";
     let titles = [
         "seed structure",
         "formula",

@@ -1,5 +1,9 @@
 //! Checks versions of the potential. Reads their files one at a time and writes nothing.
 
+use std::collections::BTreeSet;
+
+use serde_json::Value;
+
 use super::finding::Finding;
 use super::rules::{ConsistencyRule, LOST};
 use crate::database::{FromRow, Transaction, query};
@@ -30,15 +34,78 @@ const RULES: [ConsistencyRule; 3] = [
     },
 ];
 
-/// Checks the invariants between versions and their files. Tables of an earlier version have none.
+/// The decisions that took up versions, in order.
+const TAKEN_UP: &str = "SELECT sequence, detail FROM decision WHERE kind = 'version' ORDER BY sequence";
+const CONDITIONS: &str = "SELECT walk, conditions FROM walk_conditions ORDER BY walk";
+
+/// Checks the invariants between versions, their files, the decision log and the walks. Tables of an earlier version have none.
 pub(super) async fn rules(transaction: &mut Transaction) -> Result<Vec<Finding>> {
     let mut findings = Vec::new();
     if transaction.has_table("version_file").await? {
         for rule in &RULES {
             findings.extend(rule.find(transaction).await?);
         }
+        let taken_up = taken_up(transaction, &mut findings).await?;
+        findings.extend(walks(transaction, &taken_up).await?);
     }
     Ok(findings)
+}
+
+/// The versions that the log takes up. Adds a finding for each that is not registered with these
+/// files, or not newer than the one before.
+async fn taken_up(transaction: &mut Transaction, findings: &mut Vec<Finding>) -> Result<BTreeSet<u64>> {
+    const HASHES: &str =
+        "SELECT model_hash, mixture_hash FROM version WHERE number = $1 AND state = 'registered'";
+    let decisions: Vec<(i64, String)> = query(TAKEN_UP).fetch_all(&mut *transaction).await?;
+    let (mut taken_up, mut last) = (BTreeSet::new(), 0);
+    for (sequence, detail) in decisions {
+        // Text that is no JSON is a fault of its own.
+        let Ok(detail) = serde_json::from_str::<Value>(&detail) else { continue };
+        let number = detail["version"].as_u64().unwrap_or(0);
+        let known = query(HASHES).bind(i64::try_from(number).unwrap_or(i64::MAX));
+        let known: Option<(String, String)> = known.fetch_optional(&mut *transaction).await?;
+        let same = |(model, mixture): &(String, String)| {
+            detail["model"] == model.as_str() && detail["mixture"] == mixture.as_str()
+        };
+        let problem = match known {
+            None => Some("is not registered"),
+            Some(known) if !same(&known) => Some("has other files than the decision names"),
+            Some(_) if number <= last => Some("is not newer than the one before"),
+            Some(_) => None,
+        };
+        if let Some(problem) = problem {
+            let what =
+                format!("decision {sequence} takes up version {number} of the potential, which {problem}");
+            findings.push(Finding { what, then: LOST });
+        }
+        last = last.max(number);
+        taken_up.insert(number);
+    }
+    Ok(taken_up)
+}
+
+/// Checks that walks run with versions that the log has taken up.
+async fn walks(transaction: &mut Transaction, taken_up: &BTreeSet<u64>) -> Result<Option<Finding>> {
+    if !transaction.has_table("walk_conditions").await? {
+        return Ok(None);
+    }
+    let conditions: Vec<(u32, String)> = query(CONDITIONS).fetch_all(transaction).await?;
+    let version = |text: &str| {
+        let conditions: Option<Value> = serde_json::from_str(text).ok();
+        conditions.and_then(|conditions| conditions["version"].as_u64()).unwrap_or(0)
+    };
+    let is_wrong = |(_, text): &&(u32, String)| {
+        let version = version(text);
+        version > 0 && !taken_up.contains(&version)
+    };
+    let wrong: Vec<_> = conditions.iter().filter(is_wrong).collect();
+    Ok(wrong.first().map(|(walk, _)| Finding {
+        what: format!(
+            "{} walks with versions of the potential that no decision takes up (such as {walk})",
+            wrong.len()
+        ),
+        then: LOST,
+    }))
 }
 
 /// Number of files of versions.

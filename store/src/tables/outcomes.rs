@@ -3,7 +3,7 @@
 use wire::ContentHash;
 
 use super::restore::{grades, origin};
-use super::{job_counts, protocols};
+use super::{job_counts, protocols, walk_conditions};
 use crate::Store;
 use crate::checksum::{CANDIDATE, Names, ORIGINAL_GRADES, joined};
 use crate::database::{FromRow, SqlRow, query};
@@ -31,21 +31,22 @@ pub(crate) const FAILURE_CLASSES: &str = "SELECT class,
     FROM attempt CROSS JOIN job ON job.number = attempt.job
     WHERE class IS NOT NULL AND job.protocol = $1 GROUP BY class ORDER BY class";
 
+/// Grades are those of the walks $2 ≤ walk < $3: those of other versions of the potential are no measure for them.
 pub(crate) const UNLABELLED: &str = "SELECT CASE WHEN seed_structure = 4294967295 THEN 'imported' ELSE coalesce(name, '') END AS seed_name,
         formula,
         CAST(sum(CASE WHEN state = 'failed' THEN 1 ELSE 0 END) AS BIGINT) AS failed,
         CAST(sum(CASE WHEN state = 'labelled' THEN 1 ELSE 0 END) AS BIGINT) AS labelled,
-        min(CASE WHEN state = 'failed' THEN original_gamma END) AS gamma_low,
-        max(CASE WHEN state = 'failed' THEN original_gamma END) AS gamma_high,
+        min(CASE WHEN state = 'failed' THEN version_gamma END) AS gamma_low,
+        max(CASE WHEN state = 'failed' THEN version_gamma END) AS gamma_high,
         min(CASE WHEN state = 'failed' THEN relative_volume END) AS volume_low,
         max(CASE WHEN state = 'failed' THEN relative_volume END) AS volume_high,
-        min(CASE WHEN state = 'labelled' THEN original_gamma END) AS labelled_gamma_low,
-        max(CASE WHEN state = 'labelled' THEN original_gamma END) AS labelled_gamma_high,
+        min(CASE WHEN state = 'labelled' THEN version_gamma END) AS labelled_gamma_low,
+        max(CASE WHEN state = 'labelled' THEN version_gamma END) AS labelled_gamma_high,
         min(CASE WHEN state = 'labelled' THEN relative_volume END) AS labelled_volume_low,
         max(CASE WHEN state = 'labelled' THEN relative_volume END) AS labelled_volume_high
     FROM (SELECT state, coalesce(candidate.seed_structure, 4294967295) AS seed_structure,
               coalesce(candidate.formula, (SELECT structure.formula FROM structure WHERE structure.number = job.structure)) AS formula,
-              original_gamma, relative_volume
+              CASE WHEN candidate.walk >= $2 AND candidate.walk < $3 THEN original_gamma END AS version_gamma, relative_volume
           FROM job LEFT JOIN candidate ON candidate.decision = job.decision
           WHERE job.state IN ('failed', 'labelled') AND job.protocol = $1
           AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure AND label.protocol = job.protocol
@@ -67,12 +68,12 @@ const FAILED: &str = "SELECT CASE WHEN failure.seed_structure = 4294967295 THEN 
            WHERE label.protocol = $1 AND status = 'excluded' AND own.state = 'labelled'
            AND coalesce(found.seed_structure, 4294967295) = failure.seed_structure
            AND excluded.formula = failure.formula) AS labelled,
-        min(original_gamma) AS gamma_low, max(original_gamma) AS gamma_high,
+        min(version_gamma) AS gamma_low, max(version_gamma) AS gamma_high,
         min(relative_volume) AS volume_low, max(relative_volume) AS volume_high,
         CAST(NULL AS DOUBLE PRECISION) AS labelled_gamma_low, CAST(NULL AS DOUBLE PRECISION) AS labelled_gamma_high,
         CAST(NULL AS DOUBLE PRECISION) AS labelled_volume_low, CAST(NULL AS DOUBLE PRECISION) AS labelled_volume_high
     FROM (SELECT coalesce(candidate.seed_structure, 4294967295) AS seed_structure, structure.formula AS formula,
-              original_gamma, relative_volume
+              CASE WHEN candidate.walk >= $2 AND candidate.walk < $3 THEN original_gamma END AS version_gamma, relative_volume
           FROM job CROSS JOIN structure ON structure.number = job.structure
           LEFT JOIN candidate ON candidate.decision = job.decision
           WHERE job.state = 'failed' AND job.protocol = $1) AS failure
@@ -161,14 +162,22 @@ impl Store {
         Ok(rows.into_iter().map(count).collect())
     }
 
-    /// Structures without a label because labelling under this protocol failed, by seed structure and formula.
+    /// Structures without a label because labelling under this protocol failed, by seed structure and formula. The
+    /// ranges of γ are those of structures from walks with this version of the potential; all else is of all versions.
     /// Without `ranges` of the labelled ones, this reads only as many rows as there are failures.
-    pub async fn unlabelled(&self, protocol: ContentHash, ranges: bool) -> Result<Vec<Unlabelled>> {
+    pub async fn unlabelled(
+        &self,
+        protocol: ContentHash,
+        version: u32,
+        ranges: bool,
+    ) -> Result<Vec<Unlabelled>> {
         let mut transaction = self.database.begin_read().await?;
+        let walks = walk_conditions::versions(&mut transaction).await?.walks_of(version);
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let ranges = ranges || !job_counts::have_counts(&mut transaction).await?;
         let sql = if ranges { UNLABELLED } else { FAILED };
-        let rows = query(sql).bind(protocol).fetch_all(&mut transaction).await?;
+        let rows = query(sql).bind(protocol).bind(walks.start).bind(walks.end);
+        let rows = rows.fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         Ok(rows)
     }

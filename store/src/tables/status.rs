@@ -156,9 +156,13 @@ fn set_budget_reason(walks: &mut [WalkStatus], time: Option<&'static str>, limit
     }
 }
 
-/// The limit that ended walks: a time limit, or the one that the walks name.
+/// The limit that ended walks: a time limit, or the one that walks of the newest version of the potential name. What ended walks of
+/// earlier versions was raised since.
 fn used_up(time: Option<&'static str>, walks: &[WalkStatus]) -> Option<String> {
-    let ended = || walks.iter().rfind(|walk| walk.state == END_BY_BUDGET).map(|walk| walk.reason.clone());
+    let version = |walk: &WalkStatus| walk.conditions.as_ref().map_or(0, |of| of.version);
+    let newest = walks.iter().map(version).max();
+    let is_ended = |walk: &&WalkStatus| walk.state == END_BY_BUDGET && Some(version(walk)) == newest;
+    let ended = || walks.iter().rfind(is_ended).map(|walk| walk.reason.clone());
     time.map(str::to_owned).or_else(ended)
 }
 
@@ -221,4 +225,26 @@ fn with_visible_state(mut processes: Vec<ProcessRecord>) -> Vec<ProcessRecord> {
         }
     }
     processes
+}
+
+#[cfg(test)]
+mod tests {
+    use wire::WalkConditions;
+
+    use super::*;
+
+    #[test]
+    fn a_limit_that_ended_walks_of_an_earlier_version_is_not_used_up() {
+        let walk = |state: &str, version| WalkStatus {
+            state: state.into(),
+            reason: "budget.structures".into(),
+            conditions: Some(WalkConditions { version, ..WalkConditions::default() }),
+            ..WalkStatus::default()
+        };
+        let ended = || vec![walk("completed", 0), walk(END_BY_BUDGET, 0)];
+        assert_eq!(used_up(None, &ended()).as_deref(), Some("budget.structures"));
+        let went_on = [ended(), vec![walk("completed", 1)]].concat();
+        assert_eq!(used_up(None, &went_on), None);
+        assert_eq!(used_up(Some("budget.wall_hours"), &went_on).as_deref(), Some("budget.wall_hours"));
+    }
 }

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use monitor::end_reason::is_refit_due;
 use store::{ProcessRecord, Store, StoreError};
 
 use super::{LabellerSettings, Method, Shutdown, retry_until_written, run};
@@ -88,7 +89,8 @@ async fn send_heartbeat(
     let is_over = match exit_policy {
         _ if led => false,
         ExitPolicy::UntilEmpty => true,
-        ExitPolicy::UntilFinished => store.all_walks_ended().await?,
+        // Walks go on after a refit, which the next run makes.
+        ExitPolicy::UntilFinished => store.all_walks_ended().await? && !is_refit_due(store).await?,
     };
     shutdown.set_no_more_jobs(is_over);
     if !led {

@@ -146,6 +146,25 @@ fn patience_ends_a_training_that_gets_no_better() {
     assert_eq!((outcome.epoch, outcome.model.weights()), (0, model().weights()));
 }
 
+/// Whoever is killed before the model is in its file has lost nothing.
+#[test]
+fn a_training_that_has_ended_makes_no_update_again() {
+    let (data, settings) = (data(), settings());
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("run.upfit");
+    let mut weights = Vec::new();
+    for expected in [4, 0] {
+        let mut updates = 0;
+        let outcome = run(model(), &data, &settings, Some(&path), &|| false, |event| {
+            updates += u32::from(matches!(event, TrainingEvent::Update(_)));
+        });
+        let outcome = outcome.unwrap().unwrap();
+        assert_eq!((updates, outcome.history.len()), (expected, 2));
+        weights.push(outcome.model.weights().to_vec());
+    }
+    assert_eq!(weights[0], weights[1]);
+}
+
 #[test]
 fn the_best_weights_are_those_of_the_last_stage() {
     let paper = UpfitSettings { epochs: 2, loss: LossSettings::paper(), ..settings() };
