@@ -13,8 +13,8 @@ use crate::database::Database;
 use crate::error::StoreError;
 use crate::records::{CampaignRecord, Commit, ComponentRecord};
 use crate::tables::{
-    attempt_end, candidate_history, exclude, export, job_counts, listing, lower_states, outcomes, queue,
-    queue_admin, recent, status, structures, versions, without_label,
+    attempt_end, candidate_history, exclude, export, job_counts, label_arrivals, listing, lower_states,
+    outcomes, queue, queue_admin, recent, status, structures, versions, without_label,
 };
 
 /// The store in a directory, and its file.
@@ -94,6 +94,14 @@ async fn frequent_queries_use_indexes() {
     }
     let by_structure = plan(&file, check::export::CANDIDATES).await;
     assert!(by_structure.contains("SEARCH candidate USING INDEX candidate_structure"), "{by_structure}");
+    // Labels by their number, and the candidates of each in the order of the index.
+    let arrivals = plan(&file, label_arrivals::PAGE).await;
+    assert!(
+        arrivals.contains("SEARCH label USING INTEGER PRIMARY KEY")
+            && arrivals.contains("SEARCH candidate USING INDEX candidate_structure")
+            && !arrivals.contains("USE TEMP B-TREE FOR ORDER BY"),
+        "{arrivals}"
+    );
     for sql in [lower_states::ALL, lower_states::COUNT] {
         let plan = plan(&file, sql).await;
         assert!(plan.contains("SCAN other USING INDEX label_other"), "{plan}");

@@ -70,14 +70,12 @@ impl<G: Ord + Clone> ConformalMap<G> {
         self.sufficient(grade, None)?.mean()
     }
 
-    /// Compares the next structure with the bounds, then adds it. Atoms whose grade or error is not finite are left out. Returns
-    /// the bound that each atom had before.
-    pub fn learn(&mut self, atoms: &[GradedError<G>]) -> Vec<Option<f64>> {
-        let bounds: Vec<_> = atoms.iter().map(|atom| self.bound(atom.grade, Some(&atom.group))).collect();
+    /// Compares the next structure with the bounds, then adds it. Atoms whose grade or error is not finite are left out.
+    pub fn learn(&mut self, atoms: &[GradedError<G>]) {
         let finite = |atom: &&GradedError<G>| atom.grade.is_finite() && atom.error.is_finite();
-        let compared = atoms.iter().zip(&bounds).filter(|(atom, _)| finite(atom));
-        let held: Vec<_> =
-            compared.filter_map(|(atom, bound)| bound.map(|bound| atom.error <= bound)).collect();
+        let bound = |atom: &GradedError<G>| self.bound(atom.grade, Some(&atom.group));
+        let compared = atoms.iter().filter(finite);
+        let held: Vec<_> = compared.filter_map(|atom| Some(atom.error <= bound(atom)?)).collect();
         if !held.is_empty() {
             let covered = held.iter().filter(|held| **held).count();
             self.outcomes.push(covered as f64 / held.len() as f64);
@@ -94,7 +92,6 @@ impl<G: Ord + Clone> ConformalMap<G> {
             let window = self.windows.entry(key);
             window.or_insert_with(|| ConformalWindow::new(self.settings)).learn(&errors);
         }
-        bounds
     }
 
     /// How often bounds held for the newest structures, each compared with those from before it came. `None` without any.
