@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use monitor::calibration::{self, CalibrationState};
 use monitor::label_statistics::{self, LabelStatistics};
 use monitor::versions::{CampaignVersions, newest_with_labels};
 use serde_json::Value;
@@ -49,6 +50,8 @@ pub struct ProtocolLabels {
     pub protocol: Protocol,
     /// Statistics of force errors and completion.
     pub statistics: LabelStatistics,
+    /// Bounds of the force error by grade.
+    pub calibration: CalibrationState,
     /// Cost of each label, newest first.
     pub costs: Vec<LabelCost>,
     /// Failures of attempts.
@@ -103,6 +106,7 @@ impl ProtocolLabels {
         let hash = protocol.hash;
         Ok(Self {
             statistics: label_statistics::read(store, hash, Some(version)).await?,
+            calibration: calibration::read(store, hash, version).await?,
             costs: store.label_costs(hash, MAX_COSTS).await?,
             failures: store.failures(hash).await?,
             unlabelled: store.unlabelled(hash, true).await?,

@@ -1,12 +1,13 @@
 //! The JSON of `monitor`, with the sentences that its documents describe.
 
 use monitor::Snapshot;
+use monitor::calibration::CalibrationSummary;
 use monitor::candidate_details::CandidateDetails;
 use monitor::label_statistics::LabelStatistics;
 use serde_json::Value;
 use store::Protocol;
 
-use super::{end_reason, energies, reference_check};
+use super::{calibration, end_reason, energies, reference_check};
 
 /// The JSON of `calmwalk status` (docs/status.md), without the jobs of a batch system.
 pub fn snapshot(snapshot: &Snapshot) -> serde_json::Result<Value> {
@@ -24,6 +25,13 @@ pub fn snapshot(snapshot: &Snapshot) -> serde_json::Result<Value> {
 pub fn force_errors(statistics: &LabelStatistics, protocol: &Protocol) -> Value {
     let mut json = statistics.to_json(protocol);
     json["energy"]["offsets"]["note"] = energies::offsets(&statistics.energies.summary().offsets).into();
+    json
+}
+
+/// Bounds of the force error in the JSON of `calmwalk force-errors`, with the sentence that views show.
+pub fn error_bounds(summary: &CalibrationSummary) -> Value {
+    let mut json = serde_json::to_value(summary).unwrap_or_default();
+    json["note"] = calibration::sentence(summary).into();
     json
 }
 

@@ -30,7 +30,7 @@ pub fn report(
 ) -> Result<Option<LabelledReport>, CommandError> {
     let mut frames = XyzReader::open(input).map_err(CommandError::input)?;
     let bar = Bar::new(frames.length, BAR);
-    let mut labels = ScoreLabels::new(others.score_columns(), None)?;
+    let mut labels = ScoreLabels::new(others.score_columns(), None, false)?;
     let mut count = 0_u64;
     while let Some(frame) = frames.next() {
         if stop.is_cancelled() {
@@ -42,7 +42,7 @@ pub fn report(
         };
         scorer.score(&frame.structure, false).map_err(|error| at(&error))?;
         let columns = others.columns(&frame.structure, scorer).map_err(|error| at(&error))?;
-        let has_forces = labels.add(&frame, scorer, &columns)?;
+        let has_forces = labels.add(&frame, scorer, &columns, None)?;
         if let Some(planes) = planes.as_deref_mut().filter(|_| has_forces) {
             planes.add(&scorer.elements, scorer.features(), &scorer.grades.gamma);
         }

@@ -2,7 +2,7 @@
 
 use axum::extract::State;
 use axum::http::StatusCode;
-use monitor::label_statistics;
+use monitor::{calibration, label_statistics};
 use store::Store;
 
 use super::Dashboard;
@@ -19,5 +19,8 @@ async fn compute(store: Store) -> Result<String, ApiError> {
         || ApiError::new(StatusCode::NOT_FOUND, "the campaign has no label protocol, and so no labels");
     let protocol = store.protocol_in_force().await?.ok_or_else(none)?;
     let statistics = label_statistics::read(&store, protocol.hash, None).await?;
-    Ok(wording::json::force_errors(&statistics, &protocol).to_string())
+    let bounds = calibration::read(&store, protocol.hash, statistics.version.unwrap_or(0)).await?;
+    let mut json = wording::json::force_errors(&statistics, &protocol);
+    json["calibration"] = wording::json::error_bounds(&bounds.summary());
+    Ok(json.to_string())
 }

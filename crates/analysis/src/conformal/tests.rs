@@ -175,7 +175,7 @@ proptest! {
 
     /// Whatever the errors are, bounds miss no more often than Gibbs & Candès' Proposition 4.1 says.
     #[test]
-    fn the_correction_limits_misses(errors in prop::collection::vec(0.0_f64..10.0, 100..600), trend in -0.1..0.1) {
+    fn the_correction_limits_misses(errors in prop::collection::vec(0.0_f64..10.0, 100..600), trend in -0.1_f64..0.1) {
         let mut window = ConformalWindow::new(NINETY);
         let (mut missed, mut compared) = (0.0, 0.0);
         for (number, error) in errors.iter().enumerate() {
