@@ -176,18 +176,20 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
 /// Bounds of the force error in the campaign `strict`, which has too few labels for one.
 fn bounds_of_errors_are_told_and_written(here: &Path, errors: &Json) {
     let note = errors["calibration"]["note"].as_str().unwrap();
-    let labelled = errors["all"]["structures"].as_u64().unwrap();
+    let number = errors["all"]["structures"].as_u64().unwrap();
     assert!(
-        note.contains("needs 20 labelled structures") && note.ends_with(&format!(": {labelled}")),
+        note.contains("needs 20 labelled structures") && note.ends_with(&format!(": {number}")),
         "{note}"
     );
     let text = succeed(here, ["force-errors", "strict", "--calibration", "bounds.json"]);
     assert!(text.contains("bounds of the force error by γ_nbr: no bound"), "{text}");
     let file: Json = serde_json::from_str(&fs::read_to_string(here.join("bounds.json")).unwrap()).unwrap();
     assert_eq!((&file["found"], &file["version"]), (&errors["calibration"]["found"], &0.into()));
-    let told = succeed(here, ["explain", "strict", "1"]);
+    let rows = labelled(&here.join("strict"));
+    let ExportSource::Candidate { id, .. } = &rows[0].source else { panic!("an import") };
+    let told = succeed(here, ["explain", "strict", id]);
     assert!(told.contains("expected     unknown for atom"), "{told}");
-    let expected = &json(here, ["explain", "strict", "1"])["expected_errors"];
+    let expected = &json(here, ["explain", "strict", id])["expected_errors"];
     assert!(expected["worst"]["bound"].is_null() && expected["level"] == 0.9, "{expected}");
 
     // The bounds belong to the grades of one model with one artifact.
@@ -204,14 +206,13 @@ fn bounds_of_errors_are_told_and_written(here: &Path, errors: &Json) {
         assert!(table.lines().next().unwrap().ends_with(",force_error_max,force_error_bound"), "{table}");
         assert!(table.lines().skip(1).all(|row| row.ends_with(',')), "{table}");
     }
-    fs::copy(&artifact, here.join("other.npz")).unwrap();
     let other = fs::read_to_string(here.join("bounds.json")).unwrap().replacen(
         "\"mixture_hash\": \"",
         "\"mixture_hash\": \"0",
         1,
     );
     fs::write(here.join("other.json"), other).unwrap();
-    let wrong = common::refuse(here, with(&["--artifact", "other.npz", "--calibration", "other.json"]));
+    let wrong = common::refuse(here, with(&["--artifact", &artifact, "--calibration", "other.json"]));
     assert!(wrong.contains("the artifact is another one than 0"), "{wrong}");
 }
 

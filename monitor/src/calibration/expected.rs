@@ -58,7 +58,8 @@ pub async fn expected_errors(
     let held = |own: &ArrivedLabel| {
         let held =
             own.atoms.iter().filter_map(|atom| Some(atom.error <= map.bound(atom.grade, Some(&atom.group))?));
-        let (atoms, below) = held.fold((0, 0), |(atoms, below), held| (atoms + 1, below + u32::from(held)));
+        let (atoms, below) =
+            held.fold((0_u32, 0_u32), |(atoms, below), held| (atoms + 1, below + u32::from(held)));
         (atoms > 0).then(|| f64::from(below) / f64::from(atoms))
     };
     Ok(Some(ExpectedErrors {
