@@ -5,7 +5,7 @@ use wire::ContentHash;
 use super::export;
 use crate::Store;
 use crate::checksum::joined;
-use crate::database::query;
+use crate::database::{SqlRow, query};
 use crate::error::{Result, StoreError};
 use crate::export::LabelArrival;
 
@@ -54,7 +54,7 @@ impl Store {
         let (label, decision) = after.unwrap_or((0, 0));
         let page = query(PAGE).bind(number).bind(label).bind(decision).bind(limit);
         let rows = page.rows(&self.database).await?;
-        let arrival = |row| {
+        let arrival = |row: &SqlRow| {
             Ok(LabelArrival {
                 number: row.get("label_number")?,
                 decision: row.get("decision")?,
