@@ -204,6 +204,7 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     assert!(!succeed(here, ["status", "whole"]).contains("unlabelled"));
     common::report::check(here, "strict", &status, &errors);
     compared_by_pairs(here, &errors);
+    bounds_of_errors_are_told_and_written(here, &errors);
     // An unknown protocol.
     let wrong = common::refuse(here, ["force-errors", "whole", "--protocol", "nothing"]);
     assert!(wrong.contains("no protocol 'nothing'; it has 'potential'"), "{wrong}");
@@ -243,6 +244,49 @@ fn compared_by_pairs(here: &Path, errors: &Json) {
     let text = succeed(here, ["force-errors", "whole"]);
     let words = format!("{} pairs of 2 seed structures and", pairs.len());
     assert!(text.contains(&words) && text.contains("are too few for a bootstrap"), "{text}");
+}
+
+/// Bounds of the force error in the campaign `strict`, which has too few labels for one.
+fn bounds_of_errors_are_told_and_written(here: &Path, errors: &Json) {
+    let note = errors["calibration"]["note"].as_str().unwrap();
+    let number = errors["all"]["structures"].as_u64().unwrap();
+    assert!(
+        note.contains("needs 20 labelled structures") && note.ends_with(&format!(": {number}")),
+        "{note}"
+    );
+    let text = succeed(here, ["force-errors", "strict", "--calibration", "bounds.json"]);
+    assert!(text.contains("bounds of the force error by γ_nbr: no bound"), "{text}");
+    let file: Json = serde_json::from_str(&fs::read_to_string(here.join("bounds.json")).unwrap()).unwrap();
+    assert_eq!((&file["found"], &file["version"]), (&errors["calibration"]["found"], &0.into()));
+    let rows = labelled(&here.join("strict"));
+    let ExportSource::Candidate { id, .. } = &rows[0].source else { panic!("an import") };
+    let told = succeed(here, ["explain", "strict", id]);
+    assert!(told.contains("expected     unknown for atom"), "{told}");
+    let expected = &json(here, ["explain", "strict", id])["expected_errors"];
+    assert!(expected["worst"]["bound"].is_null() && expected["level"] == 0.9, "{expected}");
+
+    // The bounds belong to the grades of one model with one artifact.
+    let path = |file: &str| common::config(&format!("data/al_eam_1l/{file}")).display().to_string();
+    let (model, artifact) = (path("kokkos.npz"), path("gmm_artifacts.npz"));
+    let score = ["calm", "score", "--model", &model, "seeds.extxyz", "-o", "graded.extxyz"];
+    let with =
+        |more: &[&str]| -> Vec<String> { score.iter().chain(more).map(|word| (*word).to_owned()).collect() };
+    for source in ["bounds.json", "strict"] {
+        let right = with(&["--artifact", &artifact, "--calibration", source, "--table", "graded.csv"]);
+        let said = succeed(here, right);
+        assert!(said.contains("force_error_bound from labels of protocol 'potential'"), "{said}");
+        let table = fs::read_to_string(here.join("graded.csv")).unwrap();
+        assert!(table.lines().next().unwrap().ends_with(",force_error_max,force_error_bound"), "{table}");
+        assert!(table.lines().skip(1).all(|row| row.ends_with(',')), "{table}");
+    }
+    let other = fs::read_to_string(here.join("bounds.json")).unwrap().replacen(
+        "\"mixture_hash\": \"",
+        "\"mixture_hash\": \"0",
+        1,
+    );
+    fs::write(here.join("other.json"), other).unwrap();
+    let wrong = common::refuse(here, with(&["--artifact", &artifact, "--calibration", "other.json"]));
+    assert!(wrong.contains("the artifact is another one than 0"), "{wrong}");
 }
 
 #[test]

@@ -3,12 +3,15 @@
 mod comparison;
 
 use std::io::{self, Write};
+use std::path::PathBuf;
 
 use analysis::{CompletionBin, ErrorBin};
+use monitor::calibration;
 use monitor::label_statistics::{self, ErrorsByGrade, LARGE_FORCE_ERROR, LabelStatistics};
 use store::{Protocol, Store};
 
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
+use crate::calibration_file::CalibrationFile;
 use crate::output::{TextTable, count, decimals, print, print_json, range};
 use crate::wording;
 
@@ -22,7 +25,8 @@ const NAMES: usize = 3;
 /// (ROC-AUC) of the grade as a test for errors above 1 eV/Å. The errors of structures whose labels failed are unknown: these
 /// structures are counted separately ('without label') in their bins. Energy errors exclude a fitted offset per element, because
 /// labels and potential have different zeros of energy. Biased walks are compared with their controls, matched by pairs and pooled,
-/// with tests and with confidence intervals by bootstrap over seed structures; docs/errors.md defines each number. In a campaign with several versions of the potential, all this is of the
+/// with tests and with confidence intervals by bootstrap over seed structures; docs/errors.md defines each number. Bounds of the force error by γ_nbr
+/// are told with how often they held for labels that came later. In a campaign with several versions of the potential, all this is of the
 /// structures from walks with one version, and a table compares the versions, each by its own grades. Works while the campaign
 /// runs.
 #[derive(Debug, clap::Args)]
@@ -35,6 +39,9 @@ pub struct ForceErrorsArgs {
     /// Use structures from walks with this version of the potential [default: the newest with labels]
     #[arg(long, value_name = "N")]
     version: Option<u32>,
+    /// Also write the bounds of the force error by γ_nbr to this file, for `calmwalk calm score --calibration`
+    #[arg(long, value_name = "OUT.json")]
+    calibration: Option<PathBuf>,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -42,24 +49,35 @@ pub struct ForceErrorsArgs {
 
 impl ForceErrorsArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
-        let (protocol, statistics) = block_on(self.read())??;
+        let (protocol, statistics, bounds) = block_on(self.read())??;
+        if let Some(path) = &self.calibration {
+            bounds.write(path)?;
+        }
         if self.json {
-            print_json(&wording::json::force_errors(&statistics, &protocol))?;
+            let mut json = wording::json::force_errors(&statistics, &protocol);
+            json["calibration"] = wording::json::error_bounds(&bounds.summary);
+            print_json(&json)?;
         } else {
-            print(|out| write(out, &protocol, &statistics))?;
+            print(|out| {
+                write(out, &protocol, &statistics)?;
+                super::calibration::write(out, &bounds.summary)
+            })?;
         }
         Ok(ExitStatus::Done)
     }
 
-    async fn read(&self) -> Result<(Protocol, LabelStatistics), CommandError> {
+    async fn read(&self) -> Result<(Protocol, LabelStatistics, CalibrationFile), CommandError> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         let protocol = self.select_protocol(&store).await?;
         if let Some(version) = self.version {
             check_version(&store, version).await?;
         }
         let statistics = label_statistics::read(&store, protocol.hash, self.version).await?;
+        let version = statistics.version.unwrap_or(0);
+        let bounds = calibration::read(&store, protocol.hash, version).await?;
+        let bounds = CalibrationFile::new(&store, &protocol, bounds.summary()).await?;
         store.close().await;
-        Ok((protocol, statistics))
+        Ok((protocol, statistics, bounds))
     }
 
     async fn select_protocol(&self, store: &Store) -> Result<Protocol, CommandError> {

@@ -2,6 +2,7 @@
 
 mod agent;
 mod calculation_runner;
+mod calibration;
 mod calm;
 mod campaign_location;
 mod clean;

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use monitor::calibration::{self, CalibrationState};
 use monitor::end_reason::CampaignEnd;
 use monitor::label_statistics::comparison::WalkComparison;
 use monitor::label_statistics::{self, LabelStatistics};
@@ -53,6 +54,8 @@ pub struct ProtocolLabels {
     pub statistics: LabelStatistics,
     /// Biased walks beside their controls.
     pub comparison: WalkComparison,
+    /// Bounds of the force error by grade.
+    pub calibration: CalibrationState,
     /// Cost of each label, newest first.
     pub costs: Vec<LabelCost>,
     /// Failures of attempts.
@@ -110,6 +113,7 @@ impl ProtocolLabels {
         Ok(Self {
             comparison: statistics.comparison(),
             statistics,
+            calibration: calibration::read(store, hash, version).await?,
             costs: store.label_costs(hash, MAX_COSTS).await?,
             failures: store.failures(hash).await?,
             unlabelled: store.unlabelled(hash, version, true).await?,

@@ -1,5 +1,6 @@
 //! The tables of a report, rounded for the page and with full precision for a file.
 
+mod calibration;
 mod comparison;
 mod conditions;
 mod facts;
@@ -50,6 +51,8 @@ pub fn all(data: &ReportData) -> Vec<PageTable> {
             labels::correlations(&found.statistics),
             labels::quantiles("quantiles-gamma", "γ", &found.statistics.all.gamma),
             labels::quantiles("quantiles-gamma-nbr", "γ_{nbr}", &found.statistics.all.gamma_nbr),
+            calibration::bounds("error-bounds", &found.calibration.summary().found),
+            calibration::by_value(&found.calibration.summary()),
             versions::grades(&found.statistics),
             labels::energy_offsets(&found.statistics),
             labels::failures(&found.failures),

@@ -180,14 +180,14 @@ async fn figures_have_the_numbers_of_the_store() {
     }
     label_all(&store).await;
     let files = build(&store, None).await.unwrap();
-    assert_eq!(files.iter().filter(|file| file.path.ends_with(".png")).count(), 8);
+    assert_eq!(files.iter().filter(|file| file.path.ends_with(".png")).count(), 9);
     for svg in files.iter().filter(|file| file.path.ends_with(".svg")) {
         words(std::str::from_utf8(&svg.bytes).unwrap());
     }
     let page = file(&files, PAGE);
     words(page);
     assert!(
-        !page.contains("http://") || page.matches("http://").count() == 8,
+        !page.contains("http://") || page.matches("http://").count() == 9,
         "only names of SVG's elements"
     );
     assert!(!page.contains("https://") && page.contains("[walk]") && page.contains("tau"));
@@ -197,6 +197,14 @@ async fn figures_have_the_numbers_of_the_store() {
     let all: Vec<_> = correlations.lines().nth(1).unwrap().split(',').collect();
     assert_eq!((all[1], all[2], all[6]), ("80", "640", "1"), "{correlations}");
     assert!((all[3].parse::<f64>().unwrap() - 0.45).abs() < 1e-12 && all[4] == "37.5");
+    // The only grade between 1.5 and 2 is 1.6, and its errors are all the same.
+    let bounds = file(&files, "tables/error-bounds.csv");
+    let row =
+        bounds.lines().find(|row| row.starts_with("1.5–2,all,80,")).unwrap_or_else(|| panic!("{bounds}"));
+    let numbers: Vec<f64> = row.split(',').skip(3).map(|cell| cell.parse().unwrap()).collect();
+    assert!((numbers[0] - 0.8).abs() < 1e-9 && (numbers[1] - 0.8).abs() < 1e-9, "{row}");
+    assert_eq!(numbers[3], 60.0, "the first 20 have no bound: {row}");
+    assert!(file(&files, "figures/error-bounds.csv").contains("\nb,,,60,"));
     let bands = file(&files, "figures/errors.csv");
     let mut atoms = 0;
     for row in bands.lines().skip(1).filter(|row| row.starts_with("a,biased")) {

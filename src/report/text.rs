@@ -48,6 +48,9 @@ fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [PageTa
                 table("correlations"),
                 table("quantiles-gamma"),
                 table("quantiles-gamma-nbr"),
+                numbered("error-bounds"),
+                table("error-bounds"),
+                table("error-bounds-by-value"),
             ]),
         ),
         (

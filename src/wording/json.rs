@@ -1,12 +1,13 @@
 //! The JSON of `monitor`, with the sentences that its documents describe.
 
 use monitor::Snapshot;
+use monitor::calibration::CalibrationSummary;
 use monitor::candidate_details::CandidateDetails;
 use monitor::label_statistics::LabelStatistics;
 use serde_json::{Value, json};
 use store::Protocol;
 
-use super::{comparison, end_reason, energies, reference_check};
+use super::{calibration, comparison, end_reason, energies, reference_check};
 
 /// The JSON of `calmwalk status` (docs/status.md), without the jobs of a batch system.
 pub fn snapshot(snapshot: &Snapshot) -> serde_json::Result<Value> {
@@ -28,6 +29,13 @@ pub fn force_errors(statistics: &LabelStatistics, protocol: &Protocol) -> Value 
     let compared = statistics.comparison();
     json["biased_against_control"] = json!(compared);
     json["biased_against_control"]["notes"] = comparison::notes(&compared).into();
+    json
+}
+
+/// Bounds of the force error in the JSON of `calmwalk force-errors`, with the sentence that views show.
+pub fn error_bounds(summary: &CalibrationSummary) -> Value {
+    let mut json = serde_json::to_value(summary).unwrap_or_default();
+    json["note"] = calibration::sentence(summary).into();
     json
 }
 

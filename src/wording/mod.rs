@@ -1,6 +1,7 @@
 //! What `monitor` reads, in words: texts that several views share.
 
 pub mod budget;
+pub mod calibration;
 pub mod comparison;
 pub mod cost;
 pub mod date;

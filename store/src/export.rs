@@ -72,3 +72,14 @@ pub enum ExportSource {
         frame: u64,
     },
 }
+
+/// A label with a candidate of its structure. A structure that several walks found comes once with each of its candidates.
+#[derive(Clone, Debug)]
+pub struct LabelArrival {
+    /// Number of the label; labels have ascending numbers as they are stored.
+    pub number: i64,
+    /// Sequence number of the candidate's decision.
+    pub decision: i64,
+    /// The labelled candidate.
+    pub row: ExportRow,
+}

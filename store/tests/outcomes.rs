@@ -4,7 +4,7 @@ use store::{
     Commit, ExportFilter, FailureCount, Fate, FateCount, JobState, LabelUsage, Lease, PendingJobs,
     RelabelRequest, Store, Unlabelled, ValueRange, WalkRecord,
 };
-use wire::{Candidate, CandidateBlock, ContentHash, Origin, WalkConditions};
+use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
 use crate::common::*;
 
@@ -120,6 +120,34 @@ async fn imported_structures_count_as_others_do() {
     let imported = ExportFilter { protocol: dft, biased: false, control: false, imported: true };
     let rows = store.labelled(&imported, None, 10).await.unwrap();
     assert_eq!(rows.iter().map(|row| row.label.energy).collect::<Vec<_>>(), [-6.0]);
+}
+
+/// Labels come in another order than their structures were found, and a structure of two walks comes with both candidates.
+#[tokio::test]
+async fn labels_are_read_in_the_order_in_which_they_came() {
+    let database = TestDatabase::new();
+    let store = database.create().await.with_caller_clock();
+    for step in [1, 2, 3] {
+        accept_with(&store, step, 1.5, 1.0).await;
+    }
+    let mut again = candidate(0, 2, Origin::Control, Fate::Accepted);
+    let first = again.block.view().to_candidate();
+    let id = CandidateId { walk: WalkId(1), ..first.id };
+    again.block = CandidateBlock::encode(&Candidate { id, origin: Origin::Control, ..first });
+    store.commit(&commit_of(vec![again])).await.unwrap();
+    let leases = [lease(&store, 0).await, lease(&store, 0).await, lease(&store, 0).await];
+    for (lease, energy) in leases.iter().zip([-1.0, -2.0, -3.0]).rev() {
+        store.complete(lease, &label(energy), 1000).await.unwrap();
+    }
+    let (dft, mut after, mut found) = (protocol("dft").hash, None, Vec::new());
+    loop {
+        let page = store.label_arrivals(dft, after, 1).await.unwrap();
+        let Some(arrival) = page.first() else { break };
+        after = Some((arrival.number, arrival.decision));
+        found.push((arrival.row.label.energy, arrival.decision));
+    }
+    assert_eq!(found, [(-3.0, 3), (-2.0, 2), (-2.0, 4), (-1.0, 1)]);
+    assert_eq!(store.label_arrivals(dft, None, 10).await.unwrap().len(), 4);
 }
 
 #[tokio::test]

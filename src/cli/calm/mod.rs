@@ -12,6 +12,7 @@ mod other_scores;
 mod recalibrate;
 mod sample;
 mod score;
+mod score_calibration;
 mod score_labels;
 mod score_table;
 mod scorer;

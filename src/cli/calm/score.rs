@@ -11,6 +11,7 @@ use npyz::{NpyWriter, WriterBuilder};
 use potentials::grace::GraceModel;
 
 use super::other_scores::OtherScores;
+use super::score_calibration::{self, ScoreCalibration};
 use super::score_labels::ScoreLabels;
 use super::scorer::Scorer;
 use crate::artifact_checks::check_sound;
@@ -83,6 +84,11 @@ pub struct CalmScoreArgs {
     /// atom of the model and of the label (eV), mean and largest force error (eV/Å)
     #[arg(long, value_name = "FILE.csv")]
     table: Option<PathBuf>,
+    /// Also write force_error_bound (eV/Å) of each structure: what 90 % of the force errors of its worst atom, that with the largest
+    /// gamma_nbr, are expected to be below, from the labels of this campaign, or of a file that `calmwalk force-errors
+    /// --calibration` wrote. Model and artifact must be those of a version of its potential
+    #[arg(long, value_name = "DIR|FILE.json")]
+    calibration: Option<PathBuf>,
 }
 
 impl CalmScoreArgs {
@@ -93,6 +99,9 @@ impl CalmScoreArgs {
             refuse_to_replace(output, inputs.into_iter().chain(artifact))?;
         }
         let (model, artifact) = load_any(&self.model, self.artifact.as_deref())?;
+        let load_bounds =
+            |path: &PathBuf| ScoreCalibration::load(path, &self.model, self.artifact.as_deref());
+        let mut bounds = self.calibration.as_ref().map(load_bounds).transpose()?;
         let others = OtherScores::load(&self.model, &model, &self.baseline, &self.ensemble)?;
         let mut others = others.with_averages(&self.gamma_nbr);
         let dimension = artifact.mixture.dimension();
@@ -104,15 +113,19 @@ impl CalmScoreArgs {
         let mut feature_file = self.features.as_deref().map(AtomicFile::create).transpose()?;
         let matrix = feature_file.as_mut().map(|file| feature_matrix(file, dimension));
         let mut matrix = matrix.transpose().map_err(cannot)?;
-        let mut labels = ScoreLabels::new(others.score_columns(), self.table.as_deref())?;
+        let mut labels = ScoreLabels::new(others.score_columns(), self.table.as_deref(), bounds.is_some())?;
         let mut count = 0_u64;
         while let Some(frame) = frames.next() {
             let mut frame = frame.map_err(CommandError::input)?;
             let line = frame.line;
             scorer.score(&frame.structure, self.gradient).map_err(|error| self.at(line, error))?;
             let columns = others.columns(&frame.structure, &scorer).map_err(|error| self.at(line, error))?;
-            labels.add(&frame, &scorer, &columns)?;
+            let bound = bounds.as_mut().and_then(|bounds| bounds.bound(&frame.structure, &scorer.gamma_nbr));
+            labels.add(&frame, &scorer, &columns, bound)?;
             write_scores(&mut frame, &scorer, self.gradient);
+            if let Some(bound) = bound {
+                frame.info.insert(score_calibration::COLUMN.into(), bound.into());
+            }
             for (name, values) in columns {
                 frame.arrays.insert(name, scalars(&values));
             }
@@ -138,6 +151,9 @@ impl CalmScoreArgs {
                 self.output.display()
             )
         })?;
+        if let Some(bounds) = &bounds {
+            print(|out| writeln!(out, "{}", bounds.note()))?;
+        }
         labels.finish(self.json.as_deref(), self.figures.as_deref(), &self.input)?;
         Ok(ExitStatus::Done)
     }

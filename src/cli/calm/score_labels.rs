@@ -28,21 +28,27 @@ pub struct ScoreLabels {
 }
 
 impl ScoreLabels {
-    /// With the columns of `others` beside γ and γ_nbr, and the file for one row of each structure, if it is wanted.
-    pub fn new(others: Vec<ScoreColumn>, table: Option<&Path>) -> Result<Self, CommandError> {
+    /// With the columns of `others` beside γ and γ_nbr, and the file for one row of each structure, if it is wanted; with a column
+    /// of bounds of the force error if they are known.
+    pub fn new(
+        others: Vec<ScoreColumn>,
+        table: Option<&Path>,
+        has_bounds: bool,
+    ) -> Result<Self, CommandError> {
         let own = [ScoreColumn::grade("γ"), ScoreColumn::grade("γ_{nbr}")];
         let columns = own.into_iter().chain(others).collect();
-        let table = table.map(ScoreTable::create).transpose()?;
+        let table = table.map(|path| ScoreTable::create(path, has_bounds)).transpose()?;
         Ok(Self { table, errors: LabelledErrors::new(columns), unreadable: (0, None) })
     }
 
-    /// Adds the frame that was scored last, with the values of the other columns. Its labels must not have been moved yet. Returns
+    /// Adds the frame that was scored last, with the values of the other columns and the bound of its worst atom. Its labels must not have been moved yet. Returns
     /// whether it has force labels.
     pub fn add(
         &mut self,
         frame: &Frame,
         scorer: &Scorer,
         others: &[(String, Vec<f64>)],
+        bound: Option<f64>,
     ) -> Result<bool, CommandError> {
         let labels = frame.labels().unwrap_or_else(|error| {
             self.unreadable.0 += 1;
@@ -64,7 +70,7 @@ impl ScoreLabels {
             predicted: &predicted,
             labels: &labels,
         });
-        self.table.as_mut().map_or(Ok(()), |table| table.add(frame, scorer, &labels))?;
+        self.table.as_mut().map_or(Ok(()), |table| table.add(frame, scorer, &labels, bound))?;
         Ok(labels.forces.is_some())
     }
 

@@ -87,10 +87,10 @@ fn report(
     mut planes: Option<&mut FeaturePlanes>,
     stop: &CancellationToken,
 ) -> Result<Option<LabelledReport>, CommandError> {
-    let mut labels = ScoreLabels::new(others.score_columns(), None)?;
+    let mut labels = ScoreLabels::new(others.score_columns(), None, false)?;
     let add = |scorer: &Scorer, frame: &Frame| {
         let columns = others.columns(&frame.structure, scorer).map_err(|error| error.to_string());
-        let has_forces = labels.add(frame, scorer, &columns.map_err(AddError::Frame)?);
+        let has_forces = labels.add(frame, scorer, &columns.map_err(AddError::Frame)?, None);
         if let Some(planes) = planes.as_deref_mut().filter(|_| matches!(has_forces, Ok(true))) {
             planes.add(&scorer.elements, scorer.features(), &scorer.grades.gamma);
         }
@@ -110,11 +110,11 @@ pub fn training(
     mut training: TrainingCompositions,
     stop: &CancellationToken,
 ) -> Result<Option<TrainingCompositions>, CommandError> {
-    let mut labels = ScoreLabels::new(Vec::new(), None)?;
+    let mut labels = ScoreLabels::new(Vec::new(), None, false)?;
     for input in inputs {
         let add = |scorer: &Scorer, frame: &Frame| {
             training.add(&frame.structure, scorer.neighbours());
-            labels.add(frame, scorer, &[]).map(drop).map_err(AddError::Command)
+            labels.add(frame, scorer, &[], None).map(drop).map_err(AddError::Command)
         };
         if !each_frame(input, scorer, stop, add)? {
             return Ok(None);

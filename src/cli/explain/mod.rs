@@ -6,6 +6,7 @@ mod labels;
 
 use std::io::{self, Write};
 
+use monitor::calibration::{ExpectedErrors, expected_errors};
 use monitor::candidate_details::{
     self, CandidateDetails, Discovery, GuardDistances, GuardPairDistance, StructureSummary,
 };
@@ -24,7 +25,7 @@ const SHOWN: usize = 20;
 ///
 /// Shows the atoms that triggered it, its grades under the walker's, the selector's and the original mixture, the decision with
 /// its rule and numbers, every value of α that was tried, the attempts at its label with their costs, the error of the
-/// potential, and the later candidates that it covered. For control frames and imported structures, shows what is
+/// potential beside the one expected from earlier labels, and the later candidates that it covered. For control frames and imported structures, shows what is
 /// recorded. Works while the campaign runs and on backups.
 #[derive(Debug, clap::Args)]
 pub struct ExplainArgs {
@@ -40,11 +41,13 @@ pub struct ExplainArgs {
 
 impl ExplainArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
-        let details = block_on(read(self.location.get()?, &self.id))??;
+        let (details, expected) = block_on(read(self.location.get()?, &self.id))??;
         if self.json {
-            print_json(&wording::json::candidate(&details).map_err(CommandError::failed)?)?
+            let mut json = wording::json::candidate(&details).map_err(CommandError::failed)?;
+            json["expected_errors"] = serde_json::to_value(&expected).map_err(CommandError::failed)?;
+            print_json(&json)?
         } else {
-            print(|out| write(out, &details))?
+            print(|out| write(out, &details, expected.as_ref()))?
         }
         Ok(ExitStatus::Done)
     }
@@ -52,19 +55,27 @@ impl ExplainArgs {
 
 /// The output of the command.
 pub async fn text(location: Location, id: &str) -> Result<String, CommandError> {
-    let (mut text, details) = (Vec::new(), read(location, id).await?);
-    write(&mut text, &details).map_err(CommandError::failed)?;
+    let (mut text, (details, expected)) = (Vec::new(), read(location, id).await?);
+    write(&mut text, &details, expected.as_ref()).map_err(CommandError::failed)?;
     Ok(String::from_utf8_lossy(&text).into_owned())
 }
 
-async fn read(location: Location, id: &str) -> Result<CandidateDetails, CommandError> {
+async fn read(
+    location: Location,
+    id: &str,
+) -> Result<(CandidateDetails, Option<ExpectedErrors>), CommandError> {
     let store = Store::open_read_only(&location).await?;
     let details = candidate_details::read(&store, id).await?;
+    let expected = expected_errors(&store, &details).await?;
     store.close().await;
-    Ok(details)
+    Ok((details, expected))
 }
 
-fn write(out: &mut dyn Write, details: &CandidateDetails) -> io::Result<()> {
+fn write(
+    out: &mut dyn Write,
+    details: &CandidateDetails,
+    expected: Option<&ExpectedErrors>,
+) -> io::Result<()> {
     writeln!(out, "{}", details.id)?;
     write_structure(out, &details.structure)?;
     if let (Some(file), Some(frame)) = (&details.file, details.frame) {
@@ -82,6 +93,10 @@ fn write(out: &mut dyn Write, details: &CandidateDetails) -> io::Result<()> {
     }
     write_same(out, details)?;
     labels::write(out, details)?;
+    let expected = expected.map(wording::calibration::expected).unwrap_or_default();
+    for (k, text) in expected.iter().enumerate() {
+        line(out, if k == 0 { "expected" } else { "" }, text)?;
+    }
     for (k, what) in details.not_recorded.iter().enumerate() {
         line(out, if k == 0 { "not recorded" } else { "" }, what)?;
     }

@@ -1,5 +1,6 @@
 //! The figures, one per file: each draws a panel or more and provides its caption and data.
 
+mod calibration;
 mod collection;
 mod completion;
 mod cost;
@@ -32,6 +33,7 @@ pub fn all(data: &ReportData) -> Vec<FigureEntry> {
         part("space", "Volumes and composition", space::draw(&data.collections)),
         part("features", "Feature space", projection::draw(&data.collections)),
         part("grades", "Force errors by grade", grades::draw(&data.collections)),
+        part("error-bounds", "Bounds of the force error", calibration::draw(data)),
         part("cost", "Cost of labels", cost::draw(data)),
         part("completion", "Labelled share of structures", completion::draw(data)),
     ];

@@ -2,7 +2,7 @@
 
 use axum::extract::State;
 use axum::http::StatusCode;
-use monitor::label_statistics;
+use monitor::{calibration, label_statistics};
 use store::Store;
 
 use super::Dashboard;
@@ -19,8 +19,13 @@ async fn compute(store: Store) -> Result<String, ApiError> {
         || ApiError::new(StatusCode::NOT_FOUND, "the campaign has no label protocol, and so no labels");
     let protocol = store.protocol_in_force().await?.ok_or_else(none)?;
     let statistics = label_statistics::read(&store, protocol.hash, None).await?;
+    let bounds = calibration::read(&store, protocol.hash, statistics.version.unwrap_or(0)).await?;
     // The intervals may take seconds.
-    let json = move || wording::json::force_errors(&statistics, &protocol).to_string();
+    let json = move || {
+        let mut json = wording::json::force_errors(&statistics, &protocol);
+        json["calibration"] = wording::json::error_bounds(&bounds.summary());
+        json.to_string()
+    };
     let json = tokio::task::spawn_blocking(json).await;
     json.map_err(|error| ApiError::new(StatusCode::INTERNAL_SERVER_ERROR, error.to_string()))
 }

@@ -18,6 +18,7 @@ const INDEX: &str = include_str!("../pages/index.html");
 const FILES: &[(&str, &str)] = files![
     "actions.js",
     "api.js",
+    "calibration.js",
     "campaign_state.js",
     "candidate.js",
     "candidates.js",

@@ -1,10 +1,11 @@
 // Force errors of the labels by grade.
 
 import { fetchComputed, listen } from "./api.js";
+import { errorBounds } from "./calibration.js";
 import { LINES } from "./colours.js";
 import { comparison } from "./comparison.js";
 import { element, section, table } from "./dom.js";
-import { decimals, percent, tick, whole } from "./format.js";
+import { decimals, percent, range, tick, whole } from "./format.js";
 import { plot } from "./plot.js";
 
 export const TITLE = "Errors";
@@ -43,6 +44,7 @@ function shown(errors) {
       element("div", { class: "plots" }, figure("γ", all.gamma), figure("γ_nbr", all.gamma_nbr))),
     comparison(errors),
     section("By γ", quantiles("γ", all.gamma, errors.large)), section("By γ_nbr", quantiles("γ_nbr", all.gamma_nbr, errors.large)),
+    section("Bounds of the force error", ...errorBounds(errors.calibration)),
     section("Structures without a label", completion("γ_max", errors.completion_by_gamma), completion("V/V₀", errors.completion_by_relative_volume)),
   ];
 }
@@ -87,11 +89,6 @@ function figure(name, { bins }) {
       { colour: LINES[5], points: filled.map((bin) => [middle(bin), bin.p90, bin.p99]) }],
     lines: [{ name: "median", colour: LINES[0], points: points("median") }, { name: "90 %", colour: LINES[0], dash: "6 3", points: points("p90") },
       { name: "99 %", colour: LINES[5], dash: "2 3", points: points("p99") }] });
-}
-
-function range({ above, up_to: upTo }) {
-  if (upTo == null) return `> ${tick(above)}`;
-  return above == null ? `≤ ${tick(upTo)}` : `${tick(above)} to ${tick(upTo)}`;
 }
 
 function quantiles(name, { bins }, large) {

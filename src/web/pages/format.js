@@ -28,6 +28,12 @@ export function tick(value) {
   return String(Number(value.toPrecision(6))).replace("-", "−");
 }
 
+/** The edges of a bin. */
+export function range({ above, up_to: upTo }) {
+  if (upTo == null) return `> ${tick(above)}`;
+  return above == null ? `≤ ${tick(upTo)}` : `${tick(above)} to ${tick(upTo)}`;
+}
+
 /** A share in percent. */
 export function percent(part) {
   return part == null ? NONE : `${digits(100 * part)}\u202f%`;

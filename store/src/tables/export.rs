@@ -119,7 +119,8 @@ impl Store {
     }
 }
 
-fn candidate(row: &SqlRow, protocol_name: &str, protocol: ContentHash) -> Result<ExportRow> {
+/// A row with the columns of [`CANDIDATES`].
+pub(super) fn candidate(row: &SqlRow, protocol_name: &str, protocol: ContentHash) -> Result<ExportRow> {
     CANDIDATE.verify(row, Names::Joined)?;
     DECISION.verify(row, Names::Joined)?;
     ORIGINAL_GRADES.verify(row)?;

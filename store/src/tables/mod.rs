@@ -12,6 +12,7 @@ pub mod exclude;
 pub mod export;
 mod imports;
 pub mod job_counts;
+pub mod label_arrivals;
 pub mod label_row;
 mod labels;
 pub mod listing;

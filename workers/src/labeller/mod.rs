@@ -448,6 +448,8 @@ fn label(results: &CalculationResults) -> Label {
             electronic_steps: results.electronic_steps,
             // The store knows them.
             retry_adjustments: Vec::new(),
+            // The store says so.
+            ordered_by_value: false,
         },
     }
 }

@@ -1,0 +1,35 @@
+// Bounds of the force error by grade, and how often they held.
+
+import { LINES } from "./colours.js";
+import { element, table } from "./dom.js";
+import { decimals, percent, range, whole } from "./format.js";
+import { plot } from "./plot.js";
+
+/** The sentence, a plot, and a table of the bins; a second table of labels by value, which are fitted apart. */
+export function errorBounds({ note, found, by_value: byValue }) {
+  const parts = [element("p", {}, `${note[0].toUpperCase()}${note.slice(1)}.`)];
+  if (found.bins.some((bin) => bin.bound != null)) parts.push(element("div", { class: "plots" }, figure(found)));
+  if (found.bins.length > 0) parts.push(bins("Bounds of the force error by γ_nbr", found));
+  if (byValue) {
+    parts.push(element("p", {}, "From labels of structures that the queue chose by value:"), bins("Bounds of the force error from labels by value", byValue));
+  }
+  return parts;
+}
+
+function bins(name, { level, bins: all }) {
+  const several = new Set(all.map((bin) => bin.element)).size > 2;
+  const columns = [["γ_nbr"], ["element"], ["structures", true], [`${percent(level)} below (eV/Å)`, true], ["mean (eV/Å)", true], ["held", true],
+    ["tested by", true], ["level in force", true]];
+  const shown = all.filter((bin) => several || bin.element == null);
+  const rows = shown.map((bin) => [range(bin), bin.element ?? "all", whole(bin.structures), decimals(bin.bound, 4), decimals(bin.mean, 4),
+    percent(bin.coverage?.share), whole(bin.coverage?.structures ?? 0), percent(bin.level_in_force)]);
+  return table(name, columns, rows);
+}
+
+/** Bound and mean of each bin as steps over γ_nbr. */
+function figure({ level, bins: all }) {
+  const pooled = all.filter((bin) => bin.element == null && bin.bound != null);
+  const steps = (key) => pooled.flatMap(({ above, up_to: upTo, [key]: value }) => [[above ?? 0, value], [upTo ?? 1.5 * above, value]]);
+  return plot({ title: "Bound of the force error by γ_nbr", x: { title: "γ_nbr", least: 0 }, y: { title: "|ΔF| (eV/Å)", logarithmic: true },
+    lines: [{ name: `${percent(level)} below`, colour: LINES[5], points: steps("bound") }, { name: "mean", colour: LINES[0], points: steps("mean") }] });
+}
