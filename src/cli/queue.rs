@@ -340,6 +340,8 @@ mod tests {
             relative_volume: Some(1.0),
             overruled: false,
             relabel: None,
+            value: None,
+            value_factors: None,
         }
     }
 

@@ -284,6 +284,9 @@ pub struct LabelDetails {
     /// labels and for those of early versions.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub retry_adjustments: Vec<String>,
+    /// Whether the queue chose its structure by value (`label.order`), not in the order in which structures were found.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub ordered_by_value: bool,
 }
 
 impl LabelDetails {

@@ -13,6 +13,7 @@ pub mod export;
 mod imports;
 pub mod job_counts;
 pub mod label_row;
+pub mod label_values;
 mod labels;
 pub mod listing;
 pub mod logs;
