@@ -1,12 +1,11 @@
 //! Labels in the order of their value.
 
 use serde_json::json;
-use store::{JobState, LabelValue, Lease, ListCursor, NO_LABEL_VALUE, Store};
+use store::{Fate, JobState, LabelValue, Lease, ListCursor, NO_LABEL_VALUE, Store};
 use wire::messages::DeclineReason;
 use wire::{ContentHash, Origin};
 
 use crate::common::*;
-use store::Fate;
 
 async fn lease(store: &Store, now: i64) -> Lease {
     store.lease(protocol("dft").hash, "a", now, 600).await.unwrap().unwrap()
@@ -104,7 +103,7 @@ async fn values_are_computed_from_finished_and_queued_structures() {
     let finished = store.finished_structures(dft, 0, 9).await.unwrap();
     let found: Vec<_> = finished.iter().map(|row| (row.decision, row.labelled)).collect();
     assert_eq!(found, [(4, false), (3, true)], "newest first");
-    assert_eq!((finished[1].gamma, finished[1].relative_volume), (Some(1.4), Some(1.01)));
+    assert_eq!((finished[1].gamma, finished[1].relative_volume), (Some(1.3 + 0.1), Some(1.01)));
     assert_eq!(
         ContentHash::from_structure(&finished[1].structure),
         ContentHash::from_structure(&done.structure)
