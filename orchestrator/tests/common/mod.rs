@@ -18,7 +18,9 @@ use orchestrator::selector::{
 };
 use store::records::{AtomGrades, Commit};
 use wire::messages::{Assignment, AssignmentReport, Outcome, WalkEnd, WalkProgress};
-use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, WalkConditions};
+use wire::{
+    CampaignId, Candidate, CandidateBlock, CandidateId, CompletionCoefficients, ContentHash, WalkConditions,
+};
 
 pub const CAMPAIGN: CampaignId = CampaignId([0x9f; 16]);
 pub const DIMENSION: usize = 3;
@@ -102,6 +104,12 @@ pub fn settings(mode: CampaignMode) -> SelectorSettings {
         version: Default::default(),
         refit_at: None,
     }
+}
+
+/// A model of completion whose probability is γ₀ / (γ₀ + γ_max).
+pub fn completes_up_to(gamma: f64) -> CompletionCoefficients {
+    let weights = vec![-1.0, 0.0, 0.0, 0.0];
+    CompletionCoefficients { elements: vec![aluminium().atomic_number()], intercept: gamma.ln(), weights }
 }
 
 pub fn restore(settings: &SelectorSettings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
