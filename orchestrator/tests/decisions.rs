@@ -559,7 +559,7 @@ fn candidates_below_a_raised_threshold_are_declined() {
 /// The model sees the grade under the original mixture, which updates do not change.
 #[test]
 fn candidates_whose_labels_would_probably_fail_are_declined() {
-    let mut selector = begin(&live(), 1);
+    let mut selector = begin(&SelectorSettings { max_per_walk: 9, ..live() }, 1);
     selector.set_completion_model(completes_up_to(0.1));
     assert_eq!(
         kinds(&next_candidate(&mut selector, 5, 1, NEW)),
