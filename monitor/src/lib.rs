@@ -6,6 +6,7 @@
 //! campaign ended. Nothing here writes to the store, and nothing renders: values leave as numbers, or as the JSON that
 //! the documents describe.
 
+pub mod calibration;
 pub mod candidate_details;
 pub mod disk;
 pub mod end_reason;
