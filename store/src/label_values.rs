@@ -20,7 +20,7 @@ pub struct FinishedStructure {
     pub structure: Structure,
 }
 
-/// A structure found by a walk that waits for its label.
+/// A structure found by a walk that waits for its label, or whose label is in work.
 #[derive(Clone, Debug, PartialEq)]
 pub struct QueuedStructure {
     /// Id of the job.
@@ -35,6 +35,8 @@ pub struct QueuedStructure {
     pub formula: String,
     /// Priority of its job; higher first.
     pub priority: i32,
+    /// Whether a labeller holds its job.
+    pub leased: bool,
     /// V/V₀.
     pub relative_volume: Option<f64>,
     /// γ and γ_nbr of its atoms under the original mixture.

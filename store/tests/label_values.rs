@@ -117,6 +117,11 @@ async fn values_are_computed_from_finished_and_queued_structures() {
     assert_eq!(found, [(1, 10, 2), (2, 10, 2), (5, 0, 0)]);
     assert_eq!((queued[0].original.gamma.len(), queued[0].formula.as_str()), (ATOMS, "Si2"));
     assert_eq!(store.queued_structures(dft, 2).await.unwrap(), queued[..2]);
+    let held = lease(&store, 4).await;
+    let states: Vec<_> =
+        store.queued_structures(dft, 9).await.unwrap().iter().map(|row| (row.job, row.leased)).collect();
+    assert_eq!(states[0], (held.job, true));
+    assert!(states[1..].iter().all(|(_, leased)| !leased));
     let features = store.features_of(1).await.unwrap().unwrap();
     assert_eq!((features.len(), features[1]), (3 * ATOMS, 1.0));
     assert_eq!(store.features_of(77).await.unwrap(), None);

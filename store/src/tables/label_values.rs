@@ -34,11 +34,11 @@ pub(crate) const FINISHED: &str = concat!(
 
 /// The oldest of the highest priority. Jobs of imported structures, whose numbers are above all decisions, are left out.
 pub(crate) const QUEUED: &str = concat!(
-    "SELECT job.number AS job_number, job.priority AS job_priority, candidate.decision AS decision, original_checksum, original_grades, ",
+    "SELECT job.number AS job_number, job.priority AS job_priority, job.state AS job_state, candidate.decision AS decision, original_checksum, original_grades, ",
     joined!(candidate),
     ", ",
     joined!(structure),
-    " FROM (SELECT number AS place FROM job WHERE state = 'queued' AND protocol = $1 AND decision < 1099511627776
+    " FROM (SELECT number AS place FROM job WHERE state IN ('queued', 'leased') AND protocol = $1 AND decision < 1099511627776
           ORDER BY priority DESC, decision LIMIT $2) AS page
     CROSS JOIN job ON job.number = place
     CROSS JOIN candidate ON candidate.decision = job.decision
@@ -87,6 +87,7 @@ impl FromRow for QueuedStructure {
             seed_structure: row.get("candidate__seed_structure")?,
             formula: row.get("candidate__formula")?,
             priority: row.get("job_priority")?,
+            leased: row.get::<String>("job_state")? == "leased",
             relative_volume: row.get("candidate__relative_volume")?,
             original: grades(row.get::<Option<Vec<u8>>>("original_grades")?.as_deref())?,
             overtaken: 0,
@@ -113,7 +114,8 @@ impl Store {
         Ok(found)
     }
 
-    /// Structures that wait for a label of this protocol: the oldest of the highest priority, at most `limit`.
+    /// Structures that wait for a label of this protocol, or whose label is in work: the oldest of the highest priority, at
+    /// most `limit`.
     pub async fn queued_structures(&self, protocol: ContentHash, limit: u32) -> Result<Vec<QueuedStructure>> {
         let mut transaction = self.database.begin_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
