@@ -241,4 +241,14 @@ fn wrong_budgets_and_queues_are_refused() {
             "the speed of the labellers",
         ],
     );
+    tester.refused_with(
+        "# min_completion_probability = 0.9",
+        "min_completion_probability = 0.9",
+        &["collect.min_completion_probability is 0.9; expected mode = \"live\"", "not reproducible"],
+    );
+    tester.refused_with(
+        "# min_completion_probability = 0.9",
+        "min_completion_probability = 1.5",
+        &["expected a number above 0 and not above 1"],
+    );
 }

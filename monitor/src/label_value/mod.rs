@@ -103,11 +103,11 @@ pub fn order(rows: &[QueuedLabel], covering: &[CoveringLabel]) -> Vec<ValuedLabe
     for row in rows {
         by_priority.entry(Reverse(row.priority)).or_default().push(row);
     }
-    let start = |rows: Vec<&'_ QueuedLabel>| -> Vec<_> {
+    let mut groups: Vec<Vec<WaitingLabel<'_>>> = Vec::with_capacity(by_priority.len());
+    for rows in by_priority.into_values() {
         let number = rows.len() as u64;
-        rows.into_iter().map(|row| WaitingLabel::new(row, &known, number, covering)).collect()
-    };
-    let mut groups: Vec<Vec<WaitingLabel<'_>>> = by_priority.into_values().map(start).collect();
+        groups.push(rows.into_iter().map(|row| WaitingLabel::new(row, &known, number, covering)).collect());
+    }
     let mut ordered = Vec::with_capacity(rows.len());
     for group in 0..groups.len() {
         while let Some(place) = next(&groups[group]) {
