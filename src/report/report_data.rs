@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use monitor::completion_model::CompletionReport;
 use monitor::label_statistics::{self, LabelStatistics};
 use monitor::versions::{CampaignVersions, newest_with_labels};
 use serde_json::Value;
@@ -55,6 +56,8 @@ pub struct ProtocolLabels {
     pub failures: Vec<FailureCount>,
     /// Structures whose labels failed for good.
     pub unlabelled: Vec<Unlabelled>,
+    /// Which labels complete; `None` before the first finished one.
+    pub completion: Option<CompletionReport>,
 }
 
 impl ReportData {
@@ -106,6 +109,7 @@ impl ProtocolLabels {
             costs: store.label_costs(hash, MAX_COSTS).await?,
             failures: store.failures(hash).await?,
             unlabelled: store.unlabelled(hash, true).await?,
+            completion: CompletionReport::read(store, hash, version).await?,
             protocol,
         })
     }
