@@ -167,6 +167,18 @@ pub fn block(
     structure: Structure,
     z: [f64; DIMENSION],
 ) -> CandidateBlock {
+    expanded_block(assignment, mixture, progress, structure, z, 1.0)
+}
+
+/// The same with this V/V₀.
+pub fn expanded_block(
+    assignment: &Assignment,
+    mixture: &Mixture,
+    progress: &WalkProgress,
+    structure: Structure,
+    z: [f64; DIMENSION],
+    relative_volume: f64,
+) -> CandidateBlock {
     let features = features(z);
     let grades = grader().bonds(&structure).unwrap().grade(mixture, &features);
     // What cannot be graded is offered nevertheless.
@@ -183,7 +195,7 @@ pub fn block(
         origin: assignment.origin,
         mixture_version: mixture.version(),
         temperature: progress.temperature,
-        relative_volume: 1.0,
+        relative_volume,
         energy: -3.0,
         virial: [[0.5; 3]; 3],
         forces: vec![[0.1, -0.2, 0.3]; structure.len()],
