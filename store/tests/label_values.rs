@@ -77,6 +77,12 @@ async fn labels_tell_whether_their_structures_were_chosen_by_value() {
         labels[0].record.label.details.ordered_by_value
     };
     assert_eq!((by_value(&first).await, by_value(&second).await), (true, false));
+    // A failed job that is queued again has no value any more.
+    set(&store, &[(&names[1], 1.0)]).await;
+    let failing = lease(&store, 4).await;
+    store.fail(&failing, "crashed", "", 1, 5).await.unwrap();
+    store.retry_job(&names[1], 6).await.unwrap();
+    assert_eq!(store.queue_show(&names[1]).await.unwrap().job.value, None);
     set(&store, &[(&names[1], 1.0)]).await;
     assert_eq!(store.clear_label_values().await.unwrap(), 1);
     assert_eq!(store.queue_show(&names[1]).await.unwrap().job.value, None);

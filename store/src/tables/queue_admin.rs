@@ -267,7 +267,7 @@ impl Store {
     pub async fn retry_job(&self, id: &str, now: i64) -> Result<String> {
         let allowed = [JobState::Failed, JobState::Dropped];
         let mut change = self.change("retry", id, &allowed, "failed and dropped").await?;
-        let sql = "UPDATE job SET failures = 0, overruled = 1, state = CASE WHEN EXISTS (
+        let sql = "UPDATE job SET failures = 0, overruled = 1, value = NULL, value_factors = NULL, state = CASE WHEN EXISTS (
                        SELECT 1 FROM label WHERE label.structure = job.structure
                        AND label.protocol = job.protocol AND status IN ('label', 'excluded')
                    ) THEN 'labelled' ELSE 'queued' END WHERE number = $1";
