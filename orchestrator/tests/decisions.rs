@@ -11,6 +11,7 @@ use orchestrator::selector::{
     CampaignMode, OnForgetting, Selector, SelectorSettings, SelectorSnapshot, TrainingFrames, UpdateProtocol,
 };
 use store::records::{Commit, Fate};
+use wire::CompletionCoefficients;
 use wire::messages::{DeclineReason, Verdict, WalkEnd};
 
 use crate::common;
@@ -573,8 +574,11 @@ fn candidates_whose_labels_would_probably_fail_are_declined() {
         (kinds(&unknown), unknown.decisions[0].detail.get("completion")),
         (vec!["accepted".to_owned()], None)
     );
+    // A share that is the same for all candidates declines none.
+    selector.set_completion_model(CompletionCoefficients::constant(0.1));
+    assert_eq!(kinds(&next_candidate(&mut selector, 7, 6, [0.0, -7.0, 0.0])), ["accepted"]);
     selector.set_completion_model(completes_up_to(6.0));
-    let commit = next_candidate(&mut selector, 7, 3, far);
+    let commit = next_candidate(&mut selector, 8, 3, far);
     assert_eq!(kinds(&commit), ["declined unlikely_to_complete"]);
     let completion = &commit.decisions[0].detail["completion"];
     assert_eq!((&completion["probability"], &completion["min_probability"]), (&0.4.into(), &0.5.into()));
@@ -583,9 +587,9 @@ fn candidates_whose_labels_would_probably_fail_are_declined() {
         (0, Fate::Declined(DeclineReason::UnlikelyToComplete))
     );
     // Other reasons come first.
-    assert_eq!(kinds(&next_candidate(&mut selector, 8, 4, KNOWN)), ["declined covered"]);
+    assert_eq!(kinds(&next_candidate(&mut selector, 9, 4, KNOWN)), ["declined covered"]);
     selector.set_completion_model(completes_up_to(10.0));
-    assert_eq!(kinds(&next_candidate(&mut selector, 9, 5, far)), ["accepted"]);
+    assert_eq!(kinds(&next_candidate(&mut selector, 10, 5, far)), ["accepted"]);
 }
 
 /// The rule of updates is used in the search, not only the collection rule.

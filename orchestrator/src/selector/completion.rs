@@ -38,10 +38,12 @@ pub struct CompletionCheck {
 }
 
 impl CompletionRule {
-    /// Judges a candidate; `None` if nothing is known.
+    /// Judges a candidate; `None` if nothing is known that distinguishes candidates. By one probability for all, a share below the
+    /// limit would decline every candidate, and nothing would be learned any more.
     pub fn check(&self, graded: &RegradedCandidate) -> Option<CompletionCheck> {
         let probability = match self.source.as_ref()? {
             ProbabilitySource::Log(probability) => *probability,
+            ProbabilitySource::Model(coefficients) if coefficients.is_constant() => return None,
             ProbabilitySource::Model(coefficients) => coefficients.probability(&predictors(graded)),
         };
         let probability = (probability * PARTS).round() / PARTS;
