@@ -145,15 +145,13 @@ impl RegressionData<'_> {
             let probability = logistic(dot(row, at));
             let residual = probability - f64::from(u8::from(*happened));
             let weight = probability * (1.0 - probability);
-            for i in 0..size {
-                gradient[i] += residual * row[i];
-                for j in 0..=i {
-                    hessian[i][j] += weight * row[i] * row[j];
-                }
+            for (i, x) in row.iter().enumerate() {
+                gradient[i] += residual * x;
+                hessian[i].iter_mut().zip(&row[..=i]).for_each(|(entry, other)| *entry += weight * x * other);
             }
         }
-        for k in 1..size {
-            gradient[k] += self.penalty * at[k];
+        for (k, x) in at.iter().enumerate().skip(1) {
+            gradient[k] += self.penalty * x;
             hessian[k][k] += self.penalty;
         }
         // Where all probabilities are 0 or 1, nothing curves the loss along the intercept.
