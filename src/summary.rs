@@ -78,11 +78,20 @@ impl Summary {
     fn write_candidates(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let candidates = &self.status.candidates;
         let declined = &candidates.declined;
-        let all =
-            declined.covered + declined.duplicate + declined.too_close + declined.budget + declined.backlog;
+        let unlikely = declined.unlikely_to_complete;
+        let all = declined.covered
+            + declined.duplicate
+            + declined.too_close
+            + declined.budget
+            + declined.backlog
+            + unlikely;
+        let unlikely = match unlikely {
+            0 => String::new(),
+            unlikely => format!(", unlikely to complete {unlikely}"),
+        };
         writeln!(
             f,
-            "candidates       {} seen, {} accepted, {all} declined (covered {}, duplicate {}, too close {}, budget {}, backlog {})",
+            "candidates       {} seen, {} accepted, {all} declined (covered {}, duplicate {}, too close {}, budget {}, backlog {}{unlikely})",
             candidates.seen,
             candidates.accepted,
             declined.covered,

@@ -201,7 +201,7 @@ fn labels_beyond_the_core_hours_are_not_started() {
 fn a_long_queue_raises_the_threshold_and_the_log_can_be_replayed() {
     let directory = write(&Small { mode: "live", steps: 2000, ..Small::default() }, "");
     let here = directory.path();
-    change(here, "[run]", "queue_limit = 4\non_queue_full = \"raise\"\n[run]");
+    change(here, "[run]", "queue_limit = 4\non_queue_full = \"raise\"\norder = \"value\"\n[run]");
     let run = program(here).args(RUN).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     let mut run = Running(run);
     // The queue only grows while the labellers are paused.
@@ -210,6 +210,13 @@ fn a_long_queue_raises_the_threshold_and_the_log_can_be_replayed() {
     let held = PausedProcesses::outside_transactions(labellers, here.join("here").to_str().unwrap());
     let raised = || decisions(here).into_iter().filter(|line| line.contains("\"raised_by\"")).count();
     wait_until("the threshold is raised", || here.join("here/campaign.sqlite").exists() && raised() > 0);
+    // The run computes what the labels of the queue are worth.
+    let list = ["queue", "here", "list", "--state", "queued", "--json"];
+    let jobs = || serde_json::from_str::<Vec<Value>>(&succeed(here, list)).unwrap();
+    wait_until("structures have values", || jobs().iter().any(|job| job["value"].is_number()));
+    let jobs = jobs();
+    let valued = jobs.iter().find(|job| job["value"].is_number()).unwrap();
+    assert!(valued["value_factors"]["diversity"].as_f64().is_some_and(|part| part <= 1.0), "{valued}");
     held.resume();
     assert!(run.0.wait().unwrap().success());
     outcome(&here.join("here"));
@@ -240,5 +247,15 @@ fn wrong_budgets_and_queues_are_refused() {
             "label.on_queue_full is \"raise\"; expected \"wait\", or mode = \"live\"",
             "the speed of the labellers",
         ],
+    );
+    tester.refused_with(
+        "# min_completion_probability = 0.9",
+        "min_completion_probability = 0.9",
+        &["collect.min_completion_probability is 0.9; expected mode = \"live\"", "not reproducible"],
+    );
+    tester.refused_with(
+        "# min_completion_probability = 0.9",
+        "min_completion_probability = 1.5",
+        &["expected a number above 0 and not above 1"],
     );
 }

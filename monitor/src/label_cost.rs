@@ -81,6 +81,11 @@ impl CostEstimator {
         Some(CoreHours::from_core_seconds(predicted, self.overhead))
     }
 
+    /// Expected cost of one label job, failed attempts included. `None` before the first label, or if its size is unknown.
+    pub fn predict_job(&self, waiting: &PendingJobs) -> Option<CoreHours> {
+        self.predict([(self.size_of(waiting), 1)])
+    }
+
     /// A job has the size of the newest label of its seed structure and formula. Otherwise only the number of atoms
     /// is known.
     fn size_of(&self, waiting: &PendingJobs) -> CostPredictors {

@@ -8,6 +8,7 @@
 
 pub mod calibration;
 pub mod candidate_details;
+pub mod completion_model;
 pub mod disk;
 pub mod end_reason;
 pub mod energy_errors;
@@ -17,6 +18,7 @@ pub mod improvement;
 pub mod label_cost;
 pub mod label_queue;
 pub mod label_statistics;
+pub mod label_value;
 pub mod mixture_status;
 pub mod mixture_values;
 pub mod provenance;

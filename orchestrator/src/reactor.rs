@@ -17,14 +17,14 @@ use std::time::{Duration, Instant};
 use futures_util::FutureExt;
 use store::records::{Commit, Fate};
 use store::{Store, StoreError};
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinSet;
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, warn};
-use wire::WalkId;
 use wire::messages::WalkProgress;
 use wire::transport::{Incoming, WorkItem};
+use wire::{CompletionCoefficients, WalkId};
 
 use self::events::{EventStream, ReactorEvent};
 use crate::selector::{Scheduling, Selector, SelectorError};
@@ -86,6 +86,9 @@ pub struct Reactor {
     pub superseded: CancellationToken,
     /// Walkers wait while more label jobs than this are unfinished, unless the selector raises its threshold first.
     pub queue_limit: u64,
+    /// The newest model of the completion of labels, from the task that learns it. The selector has it before the next
+    /// decisions. `None` if nothing learns one.
+    pub completion: Option<watch::Receiver<Option<CompletionCoefficients>>>,
 }
 
 /// State of the running reactor.
@@ -127,6 +130,7 @@ impl Reactor {
         let mut stop = pin!(stopping.cancelled().fuse());
         let superseded = self.superseded;
         let mut newer_version = pin!(superseded.cancelled().fuse());
+        let mut completion = self.completion;
         let mut state = ReactorState::new(self.selector, self.store, self.stopping, self.queue_limit);
         // An interval, not a timeout since the last message: busy walkers may report progress continuously.
         let mut poll = tokio::time::interval(POLL_INTERVAL);
@@ -145,6 +149,7 @@ impl Reactor {
                 batch = events.take(), if open => {
                     let batch = batch.unwrap_or_default();
                     open = !batch.is_empty();
+                    state.receive_completion_model(&mut completion);
                     let only_progress = batch.iter().all(|event| matches!(event, ReactorEvent::Progress(..)));
                     state.decide(batch, &mut watch)?;
                     if open && only_progress {
@@ -208,6 +213,16 @@ impl ReactorState {
             unfinished: None,
             paused_polled_at: None,
         }
+    }
+
+    /// Gives the selector the newest model of completion, if there is a new one.
+    fn receive_completion_model(
+        &mut self,
+        completion: &mut Option<watch::Receiver<Option<CompletionCoefficients>>>,
+    ) {
+        let newest = completion.as_mut().filter(|model| model.has_changed().unwrap_or(false));
+        let newest = newest.and_then(|model| model.borrow_and_update().clone());
+        newest.into_iter().for_each(|model| self.selector.set_completion_model(model));
     }
 
     /// Handles a batch of events in order of arrival.

@@ -215,7 +215,15 @@ impl Arrived {
 
 fn reactor(store: &Store, selector: Selector, incoming: mpsc::Receiver<Incoming>) -> Reactor {
     let [stopping, superseded] = [(); 2].map(|()| CancellationToken::new());
-    Reactor { selector, store: store.clone(), incoming, stopping, superseded, queue_limit: 100 }
+    Reactor {
+        selector,
+        store: store.clone(),
+        incoming,
+        stopping,
+        superseded,
+        queue_limit: 100,
+        completion: None,
+    }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

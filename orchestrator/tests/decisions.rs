@@ -11,12 +11,13 @@ use orchestrator::selector::{
     CampaignMode, OnForgetting, Selector, SelectorSettings, SelectorSnapshot, TrainingFrames, UpdateProtocol,
 };
 use store::records::{Commit, Fate};
+use wire::CompletionCoefficients;
 use wire::messages::{DeclineReason, Verdict, WalkEnd};
 
 use crate::common;
 use crate::common::{
-    SHORTEST, begin, decided, ended, features, gamma_max, kinds, mixture, next_assignment, offer, positive,
-    settings, structure, try_restore, value,
+    SHORTEST, begin, completes_up_to, decided, ended, features, gamma_max, kinds, mixture, next_assignment,
+    offer, positive, settings, structure, try_restore, value,
 };
 
 /// γ = 3 in the first component.
@@ -554,6 +555,41 @@ fn candidates_below_a_raised_threshold_are_declined() {
     selector.set_unfinished_jobs(100);
     assert_eq!(next_assignment(&mut selector).threshold_factor, 1.0);
     assert_eq!((selector.max_unfinished_jobs(100), begin(&live(), 1).max_unfinished_jobs(100)), (200, 100));
+}
+
+/// The model sees the grade under the original mixture, which updates do not change.
+#[test]
+fn candidates_whose_labels_would_probably_fail_are_declined() {
+    let mut selector = begin(&SelectorSettings { max_per_walk: 9, ..live() }, 1);
+    selector.set_completion_model(completes_up_to(0.1));
+    assert_eq!(
+        kinds(&next_candidate(&mut selector, 5, 1, NEW)),
+        ["accepted"],
+        "the campaign does not ask for it"
+    );
+    selector.decline_unlikely(0.5);
+    let far = [0.0, 0.0, 9.0];
+    let unknown = next_candidate(&mut selector, 6, 2, [0.0, 0.0, 4.0]);
+    assert_eq!(
+        (kinds(&unknown), unknown.decisions[0].detail.get("completion")),
+        (vec!["accepted".to_owned()], None)
+    );
+    // A share that is the same for all candidates declines none.
+    selector.set_completion_model(CompletionCoefficients::constant(0.1));
+    assert_eq!(kinds(&next_candidate(&mut selector, 7, 6, [0.0, -7.0, 0.0])), ["accepted"]);
+    selector.set_completion_model(completes_up_to(6.0));
+    let commit = next_candidate(&mut selector, 8, 3, far);
+    assert_eq!(kinds(&commit), ["declined unlikely_to_complete"]);
+    let completion = &commit.decisions[0].detail["completion"];
+    assert_eq!((&completion["probability"], &completion["min_probability"]), (&0.4.into(), &0.5.into()));
+    assert_eq!(
+        (commit.components.len(), commit.candidates[0].fate),
+        (0, Fate::Declined(DeclineReason::UnlikelyToComplete))
+    );
+    // Other reasons come first.
+    assert_eq!(kinds(&next_candidate(&mut selector, 9, 4, KNOWN)), ["declined covered"]);
+    selector.set_completion_model(completes_up_to(10.0));
+    assert_eq!(kinds(&next_candidate(&mut selector, 10, 5, far)), ["accepted"]);
 }
 
 /// The rule of updates is used in the search, not only the collection rule.

@@ -3,6 +3,7 @@
 mod common;
 
 mod commit_batch;
+mod completion;
 mod decisions;
 mod nothing_new;
 mod reactor;

@@ -312,6 +312,7 @@ fn the_campaigns_cover_the_intended_cases() {
         "declined covered",
         "declined duplicate",
         "declined too_close",
+        "declined unlikely_to_complete",
         "nothing_new",
     ] {
         assert!(seen.contains(kind), "no {kind} in {seen:?}");

@@ -1,5 +1,6 @@
 //! `calmwalk queue`
 
+mod completion;
 mod files;
 
 use std::io::{self, Write};
@@ -43,6 +44,8 @@ pub enum QueueCommand {
         #[arg(long, short, value_name = "DIR", default_value = ".")]
         output: PathBuf,
     },
+    /// Show which labels complete: the model that the campaign has learned, and how reliable it is
+    Completion,
     /// Remove queued structures from the queue and from exports (to remove existing labels, use calmwalk exclude)
     Drop {
         /// Ids of the candidates
@@ -103,6 +106,14 @@ impl QueueArgs {
                 let written = block_on(files::write(location, id, output))??;
                 if self.json { print_json(&written)? } else { print(|out| write_files(out, &written))? }
             }
+            QueueCommand::Completion => {
+                let found = block_on(completion::read(location))??;
+                if self.json {
+                    print_json(&found)?
+                } else {
+                    print(|out| completion::write(out, found.as_ref()))?
+                }
+            }
             action => self.change(location, action)?,
         }
         Ok(ExitStatus::Done)
@@ -145,7 +156,7 @@ pub async fn change(
     let ids = match action {
         QueueCommand::Drop { ids } | QueueCommand::Retry { ids } => ids.as_slice(),
         QueueCommand::Show { id } | QueueCommand::Prioritise { id, .. } => std::slice::from_ref(id),
-        QueueCommand::List(_) | QueueCommand::Files { .. } => &[],
+        QueueCommand::List(_) | QueueCommand::Files { .. } | QueueCommand::Completion => &[],
     };
     for id in ids {
         let now = unix_milliseconds();
@@ -153,7 +164,10 @@ pub async fn change(
             QueueCommand::Drop { .. } => store.drop_job(id, now).await?,
             QueueCommand::Retry { .. } => store.retry_job(id, now).await?,
             QueueCommand::Prioritise { priority, .. } => store.prioritise_job(id, *priority, now).await?,
-            QueueCommand::List(_) | QueueCommand::Show { .. } | QueueCommand::Files { .. } => id.clone(),
+            QueueCommand::List(_)
+            | QueueCommand::Show { .. }
+            | QueueCommand::Files { .. }
+            | QueueCommand::Completion => id.clone(),
         };
         changed.push(store.queue_show(&candidate).await?.job);
     }
@@ -197,6 +211,8 @@ fn write_list(
     }
     let mut titles =
         vec!["id", "state", ">priority", ">atoms", "formula", ">γ_max", ">attempts", ">failed", "protocol"];
+    let have_values = jobs.iter().any(|job| job.value.is_some());
+    titles.extend(have_values.then_some(">value"));
     titles.extend((!versions.is_single()).then_some(">version"));
     let mut table = TextTable::new(&titles);
     for job in jobs {
@@ -211,6 +227,7 @@ fn write_list(
             job.failures.to_string(),
             job.protocol.clone(),
         ];
+        row.extend(have_values.then(|| wording::labels::value(job.value)));
         row.extend((!versions.is_single()).then(|| versions.of_candidate(&job.candidate).to_string()));
         table.push(row);
     }
@@ -235,12 +252,17 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
         formula,
         original_gamma,
         relabel,
+        value,
+        value_factors,
         excluded,
         ..
     } = &details.job;
     writeln!(out, "{candidate}")?;
     writeln!(out, "  job       {job}, protocol '{protocol}'")?;
     writeln!(out, "  state     {state}, priority {priority}")?;
+    if let Some(value) = wording::labels::value_with_factors(*value, value_factors.as_ref()) {
+        writeln!(out, "  value     {value}")?;
+    }
     if let Some(reason) = relabel {
         writeln!(out, "  relabel   requested: {reason}")?;
     }
@@ -340,6 +362,8 @@ mod tests {
             relative_volume: Some(1.0),
             overruled: false,
             relabel: None,
+            value: None,
+            value_factors: None,
         }
     }
 

@@ -205,15 +205,19 @@ fn write_candidates(
     shared: Option<u64>,
 ) -> io::Result<()> {
     let Candidates { seen, accepted, declined, control, rejected_by_guards } = candidates;
-    let reasons = [
+    let mut reasons = vec![
         ("covered", declined.covered),
         ("duplicate", declined.duplicate),
         ("too close", declined.too_close),
         ("budget", declined.budget),
         ("backlog", declined.backlog),
     ];
+    if declined.unlikely_to_complete > 0 {
+        reasons.push(("unlikely to complete", declined.unlikely_to_complete));
+    }
     let all: u64 = reasons.iter().map(|(_, count)| count).sum();
-    let reasons = reasons.map(|(reason, count)| format!("{count} {reason}")).join(", ");
+    let reasons = reasons.iter().map(|(reason, count)| format!("{count} {reason}"));
+    let reasons = reasons.collect::<Vec<_>>().join(", ");
     page.titled(out, "candidates", &format!("{seen} seen, {accepted} accepted, {all} declined ({reasons})"))?;
     let shared = match shared {
         None | Some(0) => String::new(),

@@ -5,13 +5,14 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may change when a campaign is resumed; all others keep their first values.
-pub(super) const CHANGEABLE: [&str; 63] = [
+pub(super) const CHANGEABLE: [&str; 65] = [
     "campaign.control_share",
     "seed_structures",
     "collect.max_per_walk",
     "collect.max_per_seed_structure",
     "collect.max_structures",
     "collect.declined_features_mb",
+    "collect.min_completion_probability",
     "calm.forgetting_alarm",
     "calm.max_mean_square_growth",
     "label.concurrency",
@@ -31,6 +32,7 @@ pub(super) const CHANGEABLE: [&str; 63] = [
     "label.pass_environment",
     "label.batch_system",
     "label.batch_options",
+    "label.order",
     "label.queue_limit",
     "label.on_queue_full",
     "label.guard.min_bond_lengths",

@@ -32,6 +32,7 @@ pub fn check(config: &Config) -> Vec<InvalidValue> {
         check_temperature(config),
         check_store(config),
         check_queue(config),
+        check_completion(config),
         check_budget(config),
         check_stop(config),
         check_notify(&config.notify),
@@ -103,6 +104,17 @@ fn check_queue(config: &Config) -> Result<(), InvalidValue> {
         let expected = "\"wait\", or mode = \"live\": with \"raise\", the collected structures depend on the speed of the labellers, \
                         which is not reproducible";
         return wrong("label.on_queue_full", "\"raise\"", expected);
+    }
+    Ok(())
+}
+
+/// The model of completion is learned from labels as they arrive, which depends on the speed of the labellers.
+fn check_completion(config: &Config) -> Result<(), InvalidValue> {
+    let Some(least) = config.collect.min_completion_probability else { return Ok(()) };
+    if config.campaign.mode == CampaignMode::Reproducible {
+        let expected = "mode = \"live\", or no such key: the probability is learned from labels as they arrive, and with it the collected \
+                        structures depend on the speed of the labellers, which is not reproducible";
+        return wrong("collect.min_completion_probability", least.get(), expected);
     }
     Ok(())
 }

@@ -200,6 +200,9 @@ pub struct CollectSection {
     /// Largest number of structures collected by the campaign.
     #[serde(default)]
     pub max_structures: Option<NonZeroU32>,
+    /// Smallest probability of its label's completion with which a structure is collected. Left out: every structure is.
+    #[serde(default)]
+    pub min_completion_probability: Option<Fraction>,
     /// Space in the store for feature vectors of declined candidates, MB.
     #[serde(default = "defaults::declined_features")]
     pub declined_features_mb: u64,
@@ -286,6 +289,9 @@ pub struct LabelSection {
     #[serde(default)]
     #[schemars(inner(regex(pattern = "^-")))]
     pub batch_options: Vec<String>,
+    /// Order in which queued structures of equal priority are labelled: as they were found, or by value.
+    #[serde(default)]
+    pub order: LabelOrder,
     /// Number of unfinished label jobs above which `on_queue_full` applies.
     #[serde(default = "defaults::queue_limit")]
     pub queue_limit: NonZeroU32,
@@ -314,6 +320,18 @@ pub struct ReferenceCheckSection {
     pub max_force_difference: Positive,
     /// Largest difference of a component of the stress, eV/Å³.
     pub max_stress_difference: Positive,
+}
+
+/// Order in which queued structures of equal priority are labelled.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum LabelOrder {
+    /// As they were found.
+    #[default]
+    Found,
+    /// By the value of their labels: expected error × probability of completion ÷ cost, where structures unlike those with
+    /// labels are worth more.
+    Value,
 }
 
 /// What happens while the label queue is longer than `queue_limit`.

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use monitor::calibration::{self, CalibrationState};
+use monitor::completion_model::CompletionReport;
 use monitor::end_reason::CampaignEnd;
 use monitor::label_statistics::comparison::WalkComparison;
 use monitor::label_statistics::{self, LabelStatistics};
@@ -62,6 +63,8 @@ pub struct ProtocolLabels {
     pub failures: Vec<FailureCount>,
     /// Structures whose labels failed for good.
     pub unlabelled: Vec<Unlabelled>,
+    /// Which labels complete; `None` before the first finished one.
+    pub completion: Option<CompletionReport>,
 }
 
 impl ReportData {
@@ -117,6 +120,7 @@ impl ProtocolLabels {
             costs: store.label_costs(hash, MAX_COSTS).await?,
             failures: store.failures(hash).await?,
             unlabelled: store.unlabelled(hash, version, true).await?,
+            completion: CompletionReport::read(store, hash, version).await?,
             protocol,
         })
     }

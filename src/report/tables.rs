@@ -2,6 +2,7 @@
 
 mod calibration;
 mod comparison;
+mod completion_model;
 mod conditions;
 mod facts;
 mod forgetting;
@@ -58,6 +59,9 @@ pub fn all(data: &ReportData) -> Vec<PageTable> {
             labels::failures(&found.failures),
             labels::unlabelled(&found.unlabelled),
         ]);
+    }
+    if let Some(found) = data.labels.as_ref().and_then(|labels| labels.completion.as_ref()) {
+        tables.extend([completion_model::coefficients(found), completion_model::reliability(found)]);
     }
     tables.extend([settings::settings(data), facts::provenance(data)]);
     tables.retain(|table| !table.rows.is_empty());

@@ -65,7 +65,14 @@ fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [PageTa
         ),
         (
             "Cost, failures and unlabelled structures",
-            blocks(vec![numbered("cost"), table("failures"), numbered("completion"), table("unlabelled")]),
+            blocks(vec![
+                numbered("cost"),
+                table("failures"),
+                numbered("completion"),
+                table("completion-model"),
+                table("completion-reliability"),
+                table("unlabelled"),
+            ]),
         ),
         ("Settings", blocks(vec![table("settings")])),
         ("Versions and provenance", blocks(vec![table("provenance")])),

@@ -3,6 +3,7 @@
 pub mod agent_host;
 mod agent_service;
 mod db_status;
+mod label_order;
 pub mod label_pool;
 mod labellers;
 mod listen;
@@ -31,6 +32,7 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use wire::transport::Incoming;
 
+use self::label_order::{CompletionModels, LabelOrderTask};
 use self::throughput::Throughput;
 use crate::campaign::LoadedCampaign;
 use crate::config::{Config, QueueFull};
@@ -89,10 +91,14 @@ async fn run_walks(
         go_on = reference_check::run(run, mode.accepted_check) => go_on?,
         never = single_process::write_heartbeats(run.store.clone(), run.process.clone()) => match never {},
     };
-    match (go_on, mode.in_process) {
-        (false, _) => Ok(reactor::RunOutcome::Stopped),
-        (true, true) => single_process::run(run, selector).await,
-        (true, false) => multi_process::run(run, selector).await,
+    if !go_on {
+        return Ok(reactor::RunOutcome::Stopped);
+    }
+    let order = LabelOrderTask::start(run).await?;
+    let completion = order.completion.clone();
+    match mode.in_process {
+        true => single_process::run(run, selector, completion).await,
+        false => multi_process::run(run, selector, completion).await,
     }
 }
 
@@ -105,6 +111,7 @@ fn start_reactor(
     mut selector: Selector,
     incoming: mpsc::Receiver<Incoming>,
     stopping: CancellationToken,
+    completion: CompletionModels,
 ) -> ReactorTask {
     let config = &run.campaign.config;
     let walk_steps = config.walk.equilibration_steps + config.walk.biased_steps.get();
@@ -116,6 +123,9 @@ fn start_reactor(
     if config.label.on_queue_full == QueueFull::Raise {
         selector.raise_threshold_above(queue_limit);
     }
+    if let Some(least) = config.collect.min_completion_probability {
+        selector.decline_unlikely(least.get());
+    }
     let reactor = Reactor {
         selector,
         store: run.store.clone().with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT),
@@ -123,6 +133,7 @@ fn start_reactor(
         stopping,
         superseded: run.walks_end.clone(),
         queue_limit,
+        completion,
     };
     let (store, throughput) = (run.store.clone(), Mutex::new(Throughput::default()));
     tokio::spawn(async move {

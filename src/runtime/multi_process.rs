@@ -21,6 +21,7 @@ use wire::net::StopTokens;
 use wire::shm_dir::ShmDir;
 
 use super::agent_service::AgentService;
+use super::label_order::CompletionModels;
 use super::process_manager::{self, ProcessManager};
 use super::{CHANNEL, ReactorTask, RunContext, spawn, start_reactor, wanted_walkers};
 use crate::exit_status::CommandError;
@@ -33,9 +34,13 @@ pub const LABELLER_TIMEOUT: Duration = Duration::from_secs(60);
 /// Runs the campaign until it is finished or stopped.
 ///
 /// Await this on the main thread: the walkers end with the thread that starts them.
-pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::RunOutcome, CommandError> {
+pub async fn run(
+    run: RunContext<'_>,
+    selector: Selector,
+    completion: CompletionModels,
+) -> Result<reactor::RunOutcome, CommandError> {
     let place = ShmDir::for_campaign(run.directory).map_err(CommandError::failed)?;
-    let ended = run_in(&place, run, selector).await;
+    let ended = run_in(&place, run, selector, completion).await;
     // No process needs the shared memory any more. The next start removes what cannot be removed now.
     let removed = place.remove().map_err(CommandError::failed);
     let ended = ended?;
@@ -47,6 +52,7 @@ async fn run_in(
     place: &ShmDir,
     run: RunContext<'_>,
     selector: Selector,
+    completion: CompletionModels,
 ) -> Result<reactor::RunOutcome, CommandError> {
     let RunContext { campaign, store, process, .. } = run;
     let walkers = wanted_walkers(campaign);
@@ -85,7 +91,7 @@ async fn run_in(
     let serving = tokio::spawn(async {
         tokio::try_join!(async { local.await.map_err(CommandError::failed) }, remote).map(|_| ())
     });
-    let reactor = start_reactor(run, selector, incoming, stopping);
+    let reactor = start_reactor(run, selector, incoming, stopping, completion);
     supervise(manager, reactor, no_more_work, serving, run).await
 }
 

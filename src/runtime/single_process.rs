@@ -18,6 +18,7 @@ use workers::walk::WalkContext;
 use workers::walker;
 
 use super::db_status::DbStatus;
+use super::label_order::CompletionModels;
 use super::process_manager::LABEL_CHECK_INTERVAL;
 use super::spawn::stop_labellers;
 use super::{CHANNEL, ReactorTask, RunContext, start_reactor, wanted_walkers};
@@ -25,13 +26,17 @@ use crate::campaign::LoadedCampaign;
 use crate::exit_status::CommandError;
 
 /// Runs the campaign until it is finished or stopped.
-pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::RunOutcome, CommandError> {
+pub async fn run(
+    run: RunContext<'_>,
+    selector: Selector,
+    completion: CompletionModels,
+) -> Result<reactor::RunOutcome, CommandError> {
     if let Ok(place) = ShmDir::for_campaign(run.directory) {
         // Removes what a killed run left in shared memory. This run needs nothing there.
         let _ = place.remove();
     }
     stop_labellers(run.store).await?;
-    let actors = Tasks::start(run, selector)?;
+    let actors = Tasks::start(run, selector, completion)?;
     let heartbeats = tokio::spawn(write_heartbeats(run.store.clone(), run.process.clone()));
     let ended = actors.finish().await;
     heartbeats.abort();
@@ -65,13 +70,17 @@ struct Tasks {
 
 impl Tasks {
     /// Starts all of them.
-    fn start(run: RunContext<'_>, selector: Selector) -> Result<Self, CommandError> {
+    fn start(
+        run: RunContext<'_>,
+        selector: Selector,
+        completion: CompletionModels,
+    ) -> Result<Self, CommandError> {
         let stopping = run.stop.child_token();
         let closing = Arc::new(Shutdown::new(run.stop.child_token()));
         let (to_reactor, incoming) = mpsc::channel(CHANNEL);
         let walkers = start_walkers(run.campaign, &to_reactor, &stopping)?;
         let labellers = start_labellers(run, &closing)?;
-        let reactor = start_reactor(run, selector, incoming, stopping.clone());
+        let reactor = start_reactor(run, selector, incoming, stopping.clone(), completion);
         let external_labels = labellers.is_empty().then(|| run.store.clone());
         let superseded = run.superseded.clone();
         Ok(Self { walkers, labellers, reactor, superseded, external_labels, closing, stopping })

@@ -81,6 +81,7 @@ fn candidates(text: &mut MetricsText, status: &CampaignStatus) {
         ("too_close", declined.too_close),
         ("budget", declined.budget),
         ("backlog", declined.backlog),
+        ("unlikely_to_complete", declined.unlikely_to_complete),
     ];
     let labels = fates.map(|(fate, _)| [("fate", fate)]);
     let samples: Vec<_> =

@@ -145,6 +145,10 @@ pub struct QueueEntry {
     pub overruled: bool,
     /// Why a new label was requested although there is one; cleared when it arrives.
     pub relabel: Option<String>,
+    /// What its label is worth; `None` in a queue in the order in which structures were found.
+    pub value: Option<f64>,
+    /// The factors of the value, a JSON object.
+    pub value_factors: Option<serde_json::Value>,
     /// Why its label is excluded from the data set; `None` if it is not.
     pub excluded: Option<String>,
 }

@@ -20,6 +20,7 @@ mod export;
 mod file_names;
 mod filesystem;
 mod jobs;
+mod label_values;
 mod listing;
 mod location;
 mod lock;
@@ -59,7 +60,8 @@ pub use jobs::{
     LabelRecord, LabelSource, LabelStatus, LeaseStatus, OldestLease, PastCalculation, QueueEntry,
     QueuedImports, Supersession,
 };
-pub use listing::{ListCursor, ListOrder, ListedCandidate};
+pub use label_values::{FinishedStructure, LabelValue, QueuedStructure};
+pub use listing::{ListCursor, ListOrder, ListedCandidate, NO_LABEL_VALUE};
 pub use location::{Location, ServerUrl};
 pub use lock::CampaignLock;
 pub use lower_states::{LowerState, LowerStateChange, LowerStateRule, OnLowerState, StateResult};

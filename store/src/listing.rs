@@ -13,10 +13,15 @@ pub enum ListOrder {
     Volume,
 }
 
+/// Stands for the value of a job without one in a [`ListCursor`]: values are not negative.
+pub const NO_LABEL_VALUE: f64 = -1.0;
+
 /// The end of a page: its sort value and decision.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ListCursor {
-    /// γ or V/V₀; ignored for any other order.
+    /// Priority of the job; ignored for any order but that of the queue.
+    pub priority: i32,
+    /// γ or V/V₀, or the value of the job in the order of the queue ([`NO_LABEL_VALUE`] without one); ignored for any other order.
     pub value: f64,
     /// Number of the decision.
     pub decision: i64,
@@ -63,6 +68,10 @@ pub struct ListedCandidate {
     pub priority: Option<i32>,
     /// Attempts at that job.
     pub attempts: Option<u32>,
+    /// What its label is worth; `None` in a queue in the order in which structures were found.
+    pub value: Option<f64>,
+    /// The factors of the value, a JSON object.
+    pub value_factors: Option<serde_json::Value>,
     /// Energy of its structure's label under that job's protocol, eV; `None` without a label, or if the label is
     /// excluded.
     pub energy: Option<f64>,

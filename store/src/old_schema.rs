@@ -34,6 +34,13 @@ static RENAMED: [(i64, &str, &str, &str); 4] = [
     (16, "label", "standing", "status"),
 ];
 
+/// Columns that later versions add and that queries name: the first version with the column, its table, and what stands for it
+/// before.
+static ADDED: [(i64, &str, &str); 2] = [
+    (18, "job", "CAST(NULL AS DOUBLE PRECISION) AS value"),
+    (18, "job", "CAST(NULL AS TEXT) AS value_factors"),
+];
+
 /// Parts of texts before and now.
 type Replacements = &'static [(&'static str, &'static str)];
 
@@ -100,6 +107,8 @@ fn view(schema: &str, version: i64, table: &str, columns: &[&str]) -> Option<Str
         let missing = CHECKSUMS.iter().filter(|(name, _)| *name == table).flat_map(|(_, names)| *names);
         shown.extend(missing.map(|name| format!("CAST({UNKNOWN} AS BIGINT) AS {name}")));
     }
+    let added = ADDED.iter().filter(|(first, name, _)| version < *first && *name == table);
+    shown.extend(added.map(|(.., before)| (*before).to_owned()));
     let columns_now = shown.join(", ");
     (changes || shown.len() > columns.len()).then(|| {
         format!("CREATE TEMP VIEW \"{table}\" AS SELECT {columns_now} FROM \"{schema}\".\"{table}\"; ")

@@ -72,6 +72,8 @@ pub struct Declined {
     pub budget: u64,
     /// Below the raised threshold that holds while the label queue is long.
     pub backlog: u64,
+    /// Their labels would probably fail.
+    pub unlikely_to_complete: u64,
 }
 
 /// Number of label jobs, by state.

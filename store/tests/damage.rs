@@ -372,7 +372,9 @@ async fn a_database_of_an_earlier_version_gets_checksums() {
 /// Turns it into a database of version 8 by undoing what later versions add and rename.
 async fn without_checksums(directory: &Path) {
     let mut connection = connect(directory).await;
-    let mut sql = "DROP TABLE version_file; DROP TABLE version;
+    let mut sql = "DROP INDEX job_order; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
+        CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
+        DROP TABLE version_file; DROP TABLE version;
         DROP TABLE walk_conditions; DROP TRIGGER label_has_checksum; DROP INDEX label_excluded;
         DROP INDEX label_other;
         ALTER TABLE process RENAME COLUMN start_time TO birth; ALTER TABLE walk RENAME COLUMN assignments TO turn;

@@ -11,6 +11,7 @@ mod crash;
 mod damage;
 mod exclude;
 mod file;
+mod label_values;
 mod lower_states;
 mod migration;
 mod outcomes;

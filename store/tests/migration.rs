@@ -118,7 +118,7 @@ async fn a_campaign_of_version_1_continues() {
     let directory = tempfile::tempdir().unwrap();
     let log = version_1(directory.path()).await;
     let store = Store::open(directory.path()).await.unwrap();
-    assert_eq!(version(directory.path()).await, 17);
+    assert_eq!(version(directory.path()).await, 18);
     assert_eq!(store.decision_log_text().await.unwrap(), log);
     assert_eq!((store.status().await.unwrap().candidates.accepted, counts(directory.path()).await), (2, 2));
     assert_eq!(job_counts(directory.path()).await, [("leased".into(), 1), ("queued".into(), 1)]);
@@ -146,7 +146,9 @@ async fn columns_of_version_13_are_read_under_their_former_names_and_renamed() {
     store.upsert_process(&process).await.unwrap();
     store.close().await;
     let mut connection = connect(&directory.path().join(DATABASE)).await;
-    let sql = "DROP TABLE version_file; DROP TABLE version;
+    let sql = "DROP INDEX job_order; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
+        CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
+        DROP TABLE version_file; DROP TABLE version;
         ALTER TABLE process RENAME COLUMN start_time TO birth;
         ALTER TABLE walk RENAME COLUMN assignments TO turn; ALTER TABLE walk RENAME COLUMN rejected TO refused;
         ALTER TABLE walk RENAME COLUMN rollbacks TO returns; ALTER TABLE walk_progress RENAME TO pace;
@@ -154,7 +156,7 @@ async fn columns_of_version_13_are_read_under_their_former_names_and_renamed() {
         DELETE FROM _sqlx_migrations WHERE version > 13;";
     sqlx::raw_sql(sql).execute(&mut connection).await.unwrap();
     connection.close().await.unwrap();
-    for (writes, expected) in [(false, 13), (true, 17)] {
+    for (writes, expected) in [(false, 13), (true, 18)] {
         let path = directory.path();
         let store = if writes { Store::open(path).await } else { Store::open_read_only(path).await }.unwrap();
         assert_eq!(store.load_walks().await.unwrap(), walks);
@@ -203,7 +205,7 @@ async fn a_campaign_of_version_16_has_no_versions_of_the_potential() {
     sqlx::raw_sql(TO_VERSION_16).execute(&mut connection).await.unwrap();
     sqlx::raw_sql("PRAGMA user_version = 16").execute(&mut connection).await.unwrap();
     connection.close().await.unwrap();
-    for (writes, expected) in [(false, 16), (true, 17)] {
+    for (writes, expected) in [(false, 16), (true, 18)] {
         let path = directory.path();
         let store = if writes { Store::open(path).await } else { Store::open_read_only(path).await }.unwrap();
         assert_eq!(store.versions().await.unwrap(), []);
@@ -217,6 +219,34 @@ async fn a_campaign_of_version_16_has_no_versions_of_the_potential() {
         store.close().await;
         assert_eq!(version(path).await, expected);
     }
+}
+
+#[tokio::test]
+async fn jobs_of_version_17_have_no_values() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let names = accept(&store, 2).await;
+    store.close().await;
+    let mut connection = connect(&directory.path().join(DATABASE)).await;
+    sqlx::raw_sql(TO_VERSION_17).execute(&mut connection).await.unwrap();
+    sqlx::raw_sql("PRAGMA user_version = 17").execute(&mut connection).await.unwrap();
+    connection.close().await.unwrap();
+    for (writes, expected) in [(false, 17), (true, 18)] {
+        let path = directory.path();
+        let store = if writes { Store::open(path).await } else { Store::open_read_only(path).await }.unwrap();
+        let jobs = store.queue_list(Some(JobState::Queued), 9, 0).await.unwrap();
+        assert_eq!(jobs.iter().map(|job| job.candidate.clone()).collect::<Vec<_>>(), names);
+        assert!(jobs.iter().all(|job| job.value.is_none() && job.value_factors.is_none()));
+        assert_eq!(store.list_queue(JobState::Queued, None, 9).await.unwrap().len(), 2);
+        store.close().await;
+        assert_eq!(version(path).await, expected);
+    }
+    let store = Store::open(directory.path()).await.unwrap();
+    let job = store.queue_show(&names[1]).await.unwrap().job.job;
+    let value = store::LabelValue { job, value: 2.0, factors: serde_json::json!({}) };
+    assert_eq!(store.set_label_values(&[value]).await.unwrap(), 1);
+    let lease = store.lease(protocol("dft").hash, "a", 0, 60).await.unwrap().unwrap();
+    assert_eq!(lease.candidate, names[1]);
 }
 
 #[tokio::test]

@@ -485,7 +485,7 @@ async fn the_cost_of_a_calculation_is_counted_once() {
             .flat_map(|names| names.split(','))
             .map(str::to_owned)
             .collect(),
-        ordered_by_value: true,
+        ordered_by_value: false,
     };
     let label = Label { details, ..label(-3.0) };
     store.complete(&second, &label, 5000).await.unwrap();

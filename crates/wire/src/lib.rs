@@ -7,6 +7,7 @@ extern crate self as wire;
 
 pub mod block;
 mod bytes;
+pub mod completion;
 pub mod conditions;
 mod control;
 pub mod ids;
@@ -19,6 +20,7 @@ pub mod shm_dir;
 pub mod transport;
 
 pub use block::{BlockError, Candidate, CandidateBlock, CandidateView};
+pub use completion::{CompletionCoefficients, CompletionPredictors};
 pub use conditions::WalkConditions;
 pub use ids::{CampaignId, CandidateId, ContentHash, IdError, Origin, WalkId};
 pub use mixture::{MixtureReader, SharedMixture, SharedMixtureError};

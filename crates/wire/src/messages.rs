@@ -63,16 +63,26 @@ pub enum DeclineReason {
     Budget,
     /// The grade is below the threshold, which was raised because many structures wait for labels.
     Backlog,
+    /// The calculation of its label would probably fail.
+    UnlikelyToComplete,
     /// It cannot be graded, or the mixture cannot be updated with it, or it is a control frame with atoms too close.
     LeftOut,
 }
 
 impl DeclineReason {
     /// All reasons, in the order of summaries.
-    pub const ALL: [Self; 6] =
-        [Self::Covered, Self::Duplicate, Self::TooClose, Self::Budget, Self::Backlog, Self::LeftOut];
+    pub const ALL: [Self; 7] = [
+        Self::Covered,
+        Self::Duplicate,
+        Self::TooClose,
+        Self::Budget,
+        Self::Backlog,
+        Self::UnlikelyToComplete,
+        Self::LeftOut,
+    ];
 
-    /// The serialized name: `"covered"`, `"duplicate"`, `"too_close"`, `"budget"`, `"backlog"` or `"left_out"`.
+    /// The serialized name: `"covered"`, `"duplicate"`, `"too_close"`, `"budget"`, `"backlog"`, `"unlikely_to_complete"`
+    /// or `"left_out"`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Covered => "covered",
@@ -80,6 +90,7 @@ impl DeclineReason {
             Self::TooClose => "too_close",
             Self::Budget => "budget",
             Self::Backlog => "backlog",
+            Self::UnlikelyToComplete => "unlikely_to_complete",
             Self::LeftOut => "left_out",
         }
     }

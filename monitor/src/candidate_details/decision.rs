@@ -21,12 +21,17 @@ pub struct DecisionDetails {
     pub round: u64,
     /// `accepted`, `declined` or `control`.
     pub kind: String,
-    /// Why it was declined: `covered`, `duplicate`, `too_close`, `budget` or `backlog`.
+    /// Why it was declined: `covered`, `duplicate`, `too_close`, `budget`, `backlog` or
+    /// `unlikely_to_complete`.
     pub reason: Option<String>,
     /// Factor by which a long label queue had raised the threshold.
     pub raised_by: Option<f64>,
     /// The raised threshold.
     pub raised_threshold: Option<f64>,
+    /// Predicted probability that its label completes, if `collect.min_completion_probability` was in force.
+    pub completion_probability: Option<f64>,
+    /// The smallest probability that was accepted.
+    pub min_completion_probability: Option<f64>,
     /// Version of the mixture afterwards.
     pub mixture_version: u64,
     /// The update that made the mixture cover the candidate.
@@ -109,6 +114,8 @@ impl DecisionDetails {
             reason,
             raised_by: detail["raised_by"].as_f64(),
             raised_threshold: detail["threshold"].as_f64(),
+            completion_probability: detail["completion"]["probability"].as_f64(),
+            min_completion_probability: detail["completion"]["min_probability"].as_f64(),
             mixture_version: logged.mixture_version,
             update,
             coverage,

@@ -57,8 +57,15 @@ pub async fn lead(plan: Plan) {
     });
     let stopping = tokens.stopping;
     let superseded = CancellationToken::new();
-    let reactor =
-        Reactor { selector, store: store.clone(), incoming, stopping, superseded, queue_limit: u64::MAX };
+    let reactor = Reactor {
+        selector,
+        store: store.clone(),
+        incoming,
+        stopping,
+        superseded,
+        queue_limit: u64::MAX,
+        completion: None,
+    };
     let writing = Arc::clone(&log);
     reactor.run(move |notice| writing.lock().unwrap().record(&notice, plan)).await.unwrap();
     tokens.closing.cancel();

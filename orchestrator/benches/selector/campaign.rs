@@ -151,6 +151,7 @@ pub async fn run(
         stopping: CancellationToken::new(),
         superseded: CancellationToken::new(),
         queue_limit: u64::MAX,
+        completion: None,
     };
     let offers: Arc<Vec<_>> =
         Arc::new(recording.iter().map(|blocks| Mutex::new(blocks.clone().into_iter())).collect());

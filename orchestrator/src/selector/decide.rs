@@ -12,6 +12,7 @@ use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, Fate, T
 use wire::messages::{DeclineReason, Outcome, Verdict, WalkEnd};
 use wire::{CandidateBlock, ContentHash, WalkId};
 
+use super::completion::CompletionCheck;
 use super::decision_state::{ADDITIVE, DecisionState};
 use super::error::SelectorError;
 use super::forgetting::ForgettingState;
@@ -155,8 +156,15 @@ impl DecisionState {
             detail["threshold"] =
                 json!(self.settings.collection.with_threshold_factor(self.threshold_factor).threshold());
         }
+        let completion = self.completion.as_ref().and_then(|rule| rule.check(&graded));
+        if let Some(check) = completion {
+            detail["completion"] = check.in_decision();
+        }
         let mut alarm = false;
-        let (fate, verdict) = match self.reason_to_decline(id, candidate.content, &graded) {
+        let reason = self.reason_to_decline(id, candidate.content, &graded);
+        let unlikely =
+            completion.filter(CompletionCheck::declines).map(|_| DeclineReason::UnlikelyToComplete);
+        let (fate, verdict) = match reason.or(unlikely) {
             Some(reason) => {
                 detail["reason"] = json!(reason.name());
                 (Fate::Declined(reason), Verdict::Declined(reason))
@@ -254,7 +262,8 @@ impl DecisionState {
         });
     }
 
-    /// The first applicable reason to decline, in the order too close, duplicate, budget, covered, backlog.
+    /// The first applicable reason to decline, in the order too close, duplicate, budget, covered, backlog. Only what none of
+    /// them applies to can be unlikely to complete.
     fn reason_to_decline(
         &self,
         id: WalkId,

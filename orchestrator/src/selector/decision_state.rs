@@ -11,6 +11,7 @@ use store::records::{Commit, ComponentRecord, Decision, STALENESS, WalkRecord};
 use wire::{ContentHash, WalkId};
 
 use super::backlog::Backlog;
+use super::completion::CompletionRule;
 use super::error::SelectorError;
 use super::forgetting::Forgetting;
 use super::regrade::Regrader;
@@ -64,6 +65,8 @@ pub(super) struct DecisionState {
     pub backlog: Option<Backlog>,
     /// Factor on the threshold of the collection rule.
     pub threshold_factor: f64,
+    /// The rule that declines candidates whose labels would probably fail.
+    pub completion: Option<CompletionRule>,
 }
 
 impl DecisionState {
@@ -132,6 +135,7 @@ impl DecisionState {
             rules: restored(RULES, &snapshot.values)?,
             backlog: None,
             threshold_factor: 1.0,
+            completion: None,
         })
     }
 

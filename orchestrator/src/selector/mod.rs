@@ -10,6 +10,7 @@
 //! continues exactly from the store.
 
 mod backlog;
+mod completion;
 mod decide;
 mod decision_state;
 mod error;
@@ -32,10 +33,11 @@ use calm::Mixture;
 use store::records::{Commit, WalkRecord};
 use wire::conditions::VariedConditions;
 use wire::messages::{AssignmentReport, Outcome, WalkEnd};
-use wire::{CampaignId, WalkId};
+use wire::{CampaignId, CompletionCoefficients, WalkId};
 
 use crate::grader::Grader;
 use backlog::Backlog;
+use completion::{CompletionRule, ProbabilitySource};
 pub use decide::update_settings_in_force;
 use decision_state::DecisionState;
 pub use decision_state::VERSION;
@@ -155,6 +157,19 @@ impl Selector {
     pub fn set_unfinished_jobs(&mut self, unfinished: u64) {
         self.decisions.threshold_factor =
             self.decisions.backlog.map_or(1.0, |backlog| backlog.factor(unfinished));
+    }
+
+    /// Enables declining candidates whose labels complete with a smaller probability than this, once a model is known ([`Self::set_completion_model`]).
+    /// Live mode only, since the model depends on when labels are made.
+    pub fn decline_unlikely(&mut self, min_probability: f64) {
+        self.decisions.completion = Some(CompletionRule { min_probability, source: None });
+    }
+
+    /// Sets the model by which completion is predicted, for all later decisions, if unlikely candidates are declined.
+    pub fn set_completion_model(&mut self, coefficients: CompletionCoefficients) {
+        if let Some(rule) = &mut self.decisions.completion {
+            rule.source = Some(ProbabilitySource::Model(coefficients));
+        }
     }
 
     /// Sets the paused walks, which get no assignments. In reproducible mode their round waits for them, and so do the

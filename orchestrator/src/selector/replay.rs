@@ -14,6 +14,7 @@ use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, LoggedD
 use wire::messages::WalkEnd;
 use wire::{ContentHash, WalkConditions, WalkId};
 
+use super::completion::CompletionRule;
 use super::decide::{FORGETTING, LEFT_OUT};
 use super::decision_state::{DecisionState, restored_mixture};
 use super::forgetting::Forgetting;
@@ -177,6 +178,7 @@ impl Replay {
         let regraded = candidate.ok_or_else(|| damaged(recorded, "its candidate is missing"))?;
         let step = regraded.block.view().id().step;
         self.decisions.threshold_factor = recorded.detail["raised_by"].as_f64().unwrap_or(1.0);
+        self.decisions.completion = CompletionRule::from_decision(&recorded.detail);
         let walk = self.decisions.walk_mut(id);
         walk.record.progress.step = step;
         let (mut commit, biased) = (Commit::default(), walk.is_biased());

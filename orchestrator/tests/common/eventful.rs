@@ -15,7 +15,7 @@ use wire::transport::WorkItem;
 
 use super::memory::MemoryStore;
 use super::scripted::{Event, Script, advance};
-use super::{CAMPAIGN, grader, mixture_of, seed_structure, settings};
+use super::{CAMPAIGN, completes_up_to, grader, mixture_of, seed_structure, settings};
 
 /// Number of label jobs above which a live campaign raises its threshold.
 const QUEUE_LIMIT: u64 = 5;
@@ -29,6 +29,8 @@ fn open(settings: &SelectorSettings, seeds: usize, snapshot: SelectorSnapshot) -
     let mut selector = selector.unwrap();
     if settings.mode == CampaignMode::Live {
         selector.raise_threshold_above(QUEUE_LIMIT);
+        selector.decline_unlikely(0.5);
+        selector.set_completion_model(completes_up_to(7.0));
     }
     selector
 }

@@ -18,7 +18,9 @@ use orchestrator::selector::{
 };
 use store::records::{AtomGrades, Commit};
 use wire::messages::{Assignment, AssignmentReport, Outcome, WalkEnd, WalkProgress};
-use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, WalkConditions};
+use wire::{
+    CampaignId, Candidate, CandidateBlock, CandidateId, CompletionCoefficients, ContentHash, WalkConditions,
+};
 
 pub const CAMPAIGN: CampaignId = CampaignId([0x9f; 16]);
 pub const DIMENSION: usize = 3;
@@ -104,6 +106,12 @@ pub fn settings(mode: CampaignMode) -> SelectorSettings {
     }
 }
 
+/// A model of completion whose probability is γ₀ / (γ₀ + γ_max).
+pub fn completes_up_to(gamma: f64) -> CompletionCoefficients {
+    let weights = vec![-1.0, 0.0, 0.0, 0.0];
+    CompletionCoefficients { elements: vec![aluminium().atomic_number()], intercept: gamma.ln(), weights }
+}
+
 pub fn restore(settings: &SelectorSettings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
     try_restore(settings, seeds, None, snapshot).unwrap()
 }
@@ -159,6 +167,18 @@ pub fn block(
     structure: Structure,
     z: [f64; DIMENSION],
 ) -> CandidateBlock {
+    expanded_block(assignment, mixture, progress, structure, z, 1.0)
+}
+
+/// The same with this V/V₀.
+pub fn expanded_block(
+    assignment: &Assignment,
+    mixture: &Mixture,
+    progress: &WalkProgress,
+    structure: Structure,
+    z: [f64; DIMENSION],
+    relative_volume: f64,
+) -> CandidateBlock {
     let features = features(z);
     let grades = grader().bonds(&structure).unwrap().grade(mixture, &features);
     // What cannot be graded is offered nevertheless.
@@ -175,7 +195,7 @@ pub fn block(
         origin: assignment.origin,
         mixture_version: mixture.version(),
         temperature: progress.temperature,
-        relative_volume: 1.0,
+        relative_volume,
         energy: -3.0,
         virial: [[0.5; 3]; 3],
         forces: vec![[0.1, -0.2, 0.3]; structure.len()],

@@ -27,6 +27,13 @@ pub fn write(out: &mut dyn Write, decision: &DecisionDetails, atoms: usize) -> i
     if let (Some(factor), Some(threshold)) = (decision.raised_by, decision.raised_threshold) {
         line(out, "", &format!("long label queue: threshold multiplied by {factor:.3}, to {threshold:.3}"))?;
     }
+    if let (Some(found), Some(least)) = (decision.completion_probability, decision.min_completion_probability)
+    {
+        let found = format!(
+            "predicted probability that the label completes {found:.3} (at least {least:.3} is accepted)"
+        );
+        line(out, "", &found)?;
+    }
     if let Some(update) = &decision.update {
         write_update(out, update, atoms)?;
     }
@@ -40,6 +47,7 @@ fn describe(reason: &str) -> &'static str {
         "too_close" => "atoms below a limit of guard.min_distances",
         "budget" => "its seed structure or the campaign has reached its limit",
         "backlog" => "new, but below the raised threshold",
+        "unlikely_to_complete" => "its label would probably fail (collect.min_completion_probability)",
         _ => "",
     }
 }

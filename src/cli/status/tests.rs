@@ -124,8 +124,14 @@ fn status() -> CampaignStatus {
         remark: "exit code 2: something that takes a whole sentence and some more to say".into(),
         ..ProcessRecord::new(ProcessRecord::WALKER, Some(number), 4_000_000, 0)
     };
-    let declined =
-        Declined { covered: 900_000, duplicate: 10_000, too_close: 1_000, budget: 100, backlog: 10_000 };
+    let declined = Declined {
+        covered: 900_000,
+        duplicate: 10_000,
+        too_close: 1_000,
+        budget: 100,
+        backlog: 10_000,
+        unlikely_to_complete: 0,
+    };
     CampaignStatus {
         walkers_busy: Some(0.625),
         candidates: Candidates {

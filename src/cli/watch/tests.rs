@@ -38,6 +38,8 @@ fn job(number: i64, state: JobState) -> QueueEntry {
         relative_volume: Some(1.01),
         overruled: false,
         relabel: None,
+        value: None,
+        value_factors: None,
     }
 }
 

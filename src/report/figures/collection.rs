@@ -22,7 +22,8 @@ pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
     let caption = format!(
         "Candidates of biased walks (n = {}). a, By decision of the selector: accepted, or declined because the newest mixture \
          covered them (another walk had found a similar structure), as duplicates, because atoms were too close, because \
-         the quota was reached (budget), or because too many labels were queued (backlog). The walkers’ guards rejected {} more \
+         the quota was reached (budget), because too many labels were queued (backlog), or because their labels would probably \
+         fail (unlikely to complete). The walkers’ guards rejected {} more \
          structures before they became candidates. b, Accepted structures against candidates in the order of the decisions; \
          dashed, every candidate accepted. The flatter the line, the fewer new structures the walks find.",
         grouped(candidates.seen),
@@ -33,7 +34,7 @@ pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
 
 fn draw_fates(figure: &mut Figure, numbers: &mut Csv, place: ::figures::Rectangle, candidates: &Candidates) {
     let declined = &candidates.declined;
-    let fates = [
+    let mut fates = vec![
         ("backlog", declined.backlog),
         ("budget", declined.budget),
         ("too close", declined.too_close),
@@ -41,6 +42,9 @@ fn draw_fates(figure: &mut Figure, numbers: &mut Csv, place: ::figures::Rectangl
         ("covered", declined.covered),
         ("accepted", candidates.accepted),
     ];
+    if declined.unlikely_to_complete > 0 {
+        fates.insert(0, ("unlikely to complete", declined.unlikely_to_complete));
+    }
     let names: Vec<_> = fates.iter().map(|(name, _)| (*name).to_owned()).collect();
     let largest = fates.iter().map(|(_, count)| *count).max().unwrap_or(0).max(1) as f64;
     let x = Axis::new("candidates", AxisScale::Linear, 0.0, 1.25 * largest).with_ticks(4);

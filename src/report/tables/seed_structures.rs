@@ -11,7 +11,7 @@ use super::{PageTable, count, states, text};
 pub fn seed_structures(data: &ReportData) -> PageTable {
     let caption = "Results by seed structure: biased walks and their states, candidates by fate, frames of its control walks, and labels of \
                    both.";
-    let titles = [
+    let mut titles = vec![
         "seed structure",
         "formula",
         "walks",
@@ -27,6 +27,9 @@ pub fn seed_structures(data: &ReportData) -> PageTable {
         "labelled",
         "failed",
     ];
+    // Most campaigns decline nothing for this reason.
+    let has_unlikely = data.status.candidates.declined.unlikely_to_complete > 0;
+    titles.extend(has_unlikely.then_some("unlikely to complete"));
     let mut table = PageTable::new("seed-structures", caption, &titles);
     let mut fates: BTreeMap<u64, BTreeMap<&str, u64>> = BTreeMap::new();
     for fate in &data.fates_by_seed_structure {
@@ -42,10 +45,12 @@ pub fn seed_structures(data: &ReportData) -> PageTable {
             states(walks_by_seed_structure.get(seed.name.as_str()).into_iter().flatten().copied());
         let names = ["accepted", "covered", "duplicate", "too_close", "budget", "backlog"];
         let mut row = vec![text(&seed.name), text(seed.structure.formula()), count(walks), text(ended)];
-        row.push(count(names.iter().map(|name| fate(name)).sum()));
+        let unlikely = fate("unlikely_to_complete");
+        row.push(count(names.iter().map(|name| fate(name)).sum::<u64>() + unlikely));
         row.extend(names.map(|name| count(fate(name))));
         row.extend([count(control.structures), count(biased.labelled + control.labelled)]);
         row.push(count(biased.failed + control.failed));
+        row.extend(has_unlikely.then(|| count(unlikely)));
         table.rows.push(row);
     }
     table

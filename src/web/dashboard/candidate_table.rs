@@ -7,7 +7,7 @@ use std::str::FromStr;
 use atoms::Species;
 use axum::extract::{RawQuery, State};
 use serde_json::json;
-use store::{JobState, ListCursor, ListOrder, ListedCandidate, Store, StoreError};
+use store::{JobState, ListCursor, ListOrder, ListedCandidate, NO_LABEL_VALUE, Store, StoreError};
 use wire::{WalkConditions, WalkId};
 
 use super::Dashboard;
@@ -58,7 +58,7 @@ struct CandidatePage {
 pub async fn page(State(dashboard): State<Dashboard>, RawQuery(query): RawQuery) -> ApiResult {
     let query = CandidateQuery::parse(query.as_deref().unwrap_or_default())?;
     let CandidatePage { rows, next, scanned } = query.page(&dashboard.store).await?;
-    let next = next.map(|place| format!("{:?}:{}", place.value, place.decision));
+    let next = next.map(|place| format!("{:?}:{}:{}", place.value, place.decision, place.priority));
     let imported = match query.state.filter(|_| query.order == TableOrder::Queue) {
         Some(state) => Some(dashboard.store.imported_jobs(state).await?),
         None => None,
@@ -148,7 +148,6 @@ impl CandidateQuery {
         let descending = !self.ascending;
         let order = match (self.order, self.state, self.fate.as_deref()) {
             (TableOrder::Queue, Some(state), _) => {
-                let after = after.map(|place| (place.value as i32, place.decision));
                 return store.list_queue(state, after, limit).await;
             }
             (TableOrder::Decision, _, Some(fate)) => {
@@ -172,9 +171,10 @@ impl CandidateQuery {
             TableOrder::Decision => None,
             TableOrder::Gamma => row.gamma,
             TableOrder::RelativeVolume => row.relative_volume,
-            TableOrder::Queue => row.priority.map(f64::from),
+            TableOrder::Queue => Some(row.value.unwrap_or(NO_LABEL_VALUE)),
         };
-        ListCursor { value: value.unwrap_or_default(), decision: row.decision }
+        let priority = row.priority.unwrap_or_default();
+        ListCursor { priority, value: value.unwrap_or_default(), decision: row.decision }
     }
 
     /// `elements` caches the species of formulas.
@@ -238,9 +238,10 @@ impl FromStr for TableOrder {
 }
 
 fn parse_cursor(text: &str) -> Result<ListCursor, ApiError> {
-    let read = |(value, decision): (&str, &str)| {
+    let read = |(value, place): (&str, &str)| {
         let value = value.parse().ok().filter(|value: &f64| value.is_finite())?;
-        Some(ListCursor { value, decision: decision.parse().ok()? })
+        let (decision, priority) = place.split_once(':')?;
+        Some(ListCursor { priority: priority.parse().ok()?, value, decision: decision.parse().ok()? })
     };
     let wrong = || ApiError::bad_request(format!("after is '{text}', expected 'next' of the previous page"));
     text.split_once(':').and_then(read).ok_or_else(wrong)
@@ -262,10 +263,11 @@ mod tests {
     #[test]
     fn queries_are_parsed_or_refused_with_a_reason() {
         let query =
-            CandidateQuery::parse("order=gamma&ascending=true&fate=&where=gamma+%3E+2&after=2.5:17").unwrap();
+            CandidateQuery::parse("order=gamma&ascending=true&fate=&where=gamma+%3E+2&after=2.5:17:10")
+                .unwrap();
         assert!(query.order == TableOrder::Gamma && query.ascending && query.fate.is_none());
         assert_eq!(query.filter.unwrap().to_string(), "gamma > 2.0");
-        assert_eq!(query.after, Some(ListCursor { value: 2.5, decision: 17 }));
+        assert_eq!(query.after, Some(ListCursor { priority: 10, value: 2.5, decision: 17 }));
         for (query, why) in [
             ("order=size", "expected one of decision"),
             ("order=queue", "give 'state'"),

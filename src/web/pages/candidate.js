@@ -4,7 +4,7 @@ import { buttons } from "./actions.js";
 import { candidatePath, fetchJson } from "./api.js";
 import { DASHES, LINES } from "./colours.js";
 import { element, facts, section, state, table, words } from "./dom.js";
-import { decimals, digits, duration, percent, shortName, time, whole } from "./format.js";
+import { decimals, digits, duration, labelValue, percent, shortName, time, whole } from "./format.js";
 import { plot } from "./plot.js";
 import { view } from "./structure.js";
 
@@ -134,11 +134,19 @@ function labels({ jobs, labels: made }, reload, signal) {
   return [...jobs.map((found) => element("div", {}, job(found), buttons(found, reload))), ...made.map(label)];
 }
 
+/** The value of a queued label with its factors. */
+function valueWithFactors({ value, value_factors: factors }) {
+  if (!factors || factors.age == null) return labelValue(value);
+  return `${labelValue(value)} = expected error ${digits(factors.expected_error)} × completion ${digits(factors.completion)} ÷ cost ${digits(factors.core_hours)}`
+    + ` × diversity ${digits(factors.diversity)} × age ${digits(factors.age)}`;
+}
+
 function job(found) {
   const { holder, attempts_made: attempts, manual_actions: manual } = found;
   return element("div", {}, facts([
     ["job", `${found.job}, protocol ${found.protocol}`],
     ["state", element("span", {}, state(found.state), ` priority ${found.priority}`)],
+    ["value", found.value == null ? null : valueWithFactors(found)],
     ["excluded", found.excluded && `its label is excluded from exports and statistics: ${found.excluded}`],
     ["leased by", holder && `${holder}, until ${time(found.expires)}`],
     ["cost", found.core_seconds == null ? null : digits(found.core_seconds, "core-seconds")],

@@ -3,14 +3,14 @@
 import { fetchJson } from "./api.js";
 import { FATES } from "./colours.js";
 import { element, renew, state, words } from "./dom.js";
-import { decimals, shortName, whole } from "./format.js";
+import { decimals, labelValue, shortName, whole } from "./format.js";
 
 export const TITLE = "Candidates";
 
 const LENGTH = 50;
 const STATES = ["queued", "leased", "labelled", "failed", "dropped", "superseded"];
 /** Columns: title, whether it is numeric, and the sort order of its title. */
-const COLUMNS = [["candidate"], ["decision", true, "decision"], ["fate"], ["label"], ["priority", true, "queue"], ["γ_max", true, "gamma"],
+const COLUMNS = [["candidate"], ["decision", true, "decision"], ["fate"], ["label"], ["priority", true, "queue"], ["value", true], ["γ_max", true, "gamma"],
   ["γ_nbr", true], ["V/V₀", true, "relative_volume"], ["T", true], ["seed structure"], ["formula"], ["atoms", true], ["attempts", true]];
 
 export function show(content, rest, signal) {
@@ -122,7 +122,7 @@ function line(candidate, columns) {
   const cells = [
     element("a", { href: `#candidate/${encodeURIComponent(candidate.id)}`, title: candidate.id }, shortName(candidate.id)),
     whole(candidate.decision), state(fate), candidate.job_state ? state(candidate.job_state) : "–",
-    candidate.priority ?? "–", decimals(candidate.gamma, 2), decimals(candidate.gamma_nbr, 2),
+    candidate.priority ?? "–", labelValue(candidate.value), decimals(candidate.gamma, 2), decimals(candidate.gamma_nbr, 2),
     decimals(candidate.relative_volume, 4), decimals(candidate.temperature, 0, "K"), candidate.seed_structure, candidate.formula,
     whole(candidate.atoms), candidate.attempts ?? "–", whole(candidate.version)];
   return element("tr", {}, columns.map(([, isNumber], k) => element("td", { class: isNumber && "number" }, cells[k])));

@@ -15,6 +15,7 @@ export const FATES = {
   too_close: { colour: "#d55e00", shape: "triangle" },
   budget: { colour: "#cc79a7", shape: "cross" },
   backlog: { colour: "#0072b2", shape: "plus" },
+  unlikely_to_complete: { colour: "#7a5c3d", shape: "cross" },
   control: { colour: "#8a8f98", shape: "ring" },
 };
 

@@ -23,6 +23,11 @@ export function digits(value, unit = "") {
   return decimals(value, size >= 100 ? 0 : size >= 10 ? 1 : size >= 1 ? 2 : 3, unit);
 }
 
+/** The value of a queued label. One that is next for its age has the largest number. */
+export function labelValue(value) {
+  return value > 1e300 ? "next" : digits(value);
+}
+
 /** A number with up to six significant digits. */
 export function tick(value) {
   return String(Number(value.toPrecision(6))).replace("-", "−");

@@ -72,7 +72,7 @@ const TABLES: [CopiedTable; 19] = [
     table!("walk_conditions" { walk: I, conditions: T, checksum: I }),
     table!("job" {
         number: I, structure: I, protocol: I, decision: I, state: T, priority: I, holder: T, expires: I, attempts: I,
-        failures: I, overruled: I, relabel: T, relabel_after: I,
+        failures: I, overruled: I, relabel: T, relabel_after: I, value: R, value_factors: T,
     }),
     table!("attempt" {
         job: I, attempt: I, holder: T, calculation: T, started: I, ended: I, outcome: T, class: T, log: T, cores: I,

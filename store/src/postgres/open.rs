@@ -16,10 +16,10 @@ use crate::old_schema::{self, FIRST_WITH_CHECKSUMS, FIRST_WITH_PRESENT_WORDS};
 use crate::tables::{checksums, renamed_words};
 
 /// The newest migration.
-const SCHEMA: i64 = 17;
+const SCHEMA: i64 = 18;
 
 /// The migrations in order.
-pub(crate) static STEPS: [MigrationSource; 16] = [
+pub(crate) static STEPS: [MigrationSource; 17] = [
     (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
     (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
     (4, "counts", include_str!("../../migrations/postgres/0004_counts.sql")),
@@ -36,6 +36,7 @@ pub(crate) static STEPS: [MigrationSource; 16] = [
     (15, "assignments", include_str!("../../migrations/postgres/0015_assignments.sql")),
     (16, "words", include_str!("../../migrations/postgres/0016_words.sql")),
     (17, "versions", include_str!("../../migrations/postgres/0017_versions.sql")),
+    (18, "label values", include_str!("../../migrations/postgres/0018_label_values.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));

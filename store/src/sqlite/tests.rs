@@ -13,8 +13,8 @@ use crate::database::Database;
 use crate::error::StoreError;
 use crate::records::{CampaignRecord, Commit, ComponentRecord};
 use crate::tables::{
-    attempt_end, candidate_history, exclude, export, job_counts, label_arrivals, listing, lower_states,
-    outcomes, queue, queue_admin, recent, status, structures, versions, without_label,
+    attempt_end, candidate_history, exclude, export, job_counts, label_arrivals, label_values, listing,
+    lower_states, outcomes, queue, queue_admin, recent, status, structures, versions, without_label,
 };
 
 /// The store in a directory, and its file.
@@ -75,6 +75,7 @@ async fn frequent_queries_use_indexes() {
         listing::LARGEST_VOLUME,
         listing::SMALLEST_VOLUME,
         listing::OF_WALK,
+        label_values::FINISHED_AFTER,
         job_counts::LABELS_SINCE,
         label_arrivals::PAGE,
         outcomes::CORES_IN_USE,

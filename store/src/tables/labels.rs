@@ -20,7 +20,7 @@ impl Store {
     /// ([`Store::relabel`]), the first result of an attempt that began after the request becomes the label and
     /// supersedes the old one. [`Store::set_lower_state_rule`] may prefer a lower state. A job that was dropped or
     /// superseded meanwhile stays so. The label's details get the retry adjustments of its calculation
-    /// ([`Store::record_calculation`]). Delivering the result of an attempt twice changes nothing.
+    /// ([`Store::record_calculation`]), and whether its job had a value when it was leased. Delivering the result of an attempt twice changes nothing.
     ///
     /// # Errors
     /// [`StoreError::InvalidLabel`] for a wrong number of forces, or for numbers that are not finite.
@@ -43,7 +43,7 @@ impl Store {
             return Ok(if check { CompleteOutcome::KeptAsCheck } else { CompleteOutcome::Label });
         }
         let source = LabelSource::Attempt { job: lease.job, attempt: lease.attempt };
-        let label = with_retry_adjustments(&mut transaction, lease, label).await?;
+        let label = with_calculation_details(&mut transaction, lease, label).await?;
         let status = add(&mut transaction, job.structure, job.protocol, &label, &source, now).await?;
         let outcome = if status == LabelStatus::Label { "labelled" } else { "check" };
         let sql = "UPDATE attempt SET ended = $1, outcome = $2 WHERE job = $3 AND attempt = $4";
@@ -55,17 +55,20 @@ impl Store {
     }
 }
 
-/// The label with the retry adjustments of its calculation.
-async fn with_retry_adjustments(
+/// The label with the retry adjustments of its calculation, and whether its job was leased by value.
+async fn with_calculation_details(
     transaction: &mut Transaction,
     lease: &Lease,
     label: &Label,
 ) -> Result<Label> {
-    let sql = "SELECT remedies FROM attempt WHERE job = $1 AND attempt = $2";
-    let names = query(sql).bind(lease.job).bind(lease.attempt);
-    let names: Option<Option<String>> = names.fetch_optional(&mut *transaction).await?;
+    let sql = "SELECT remedies, value FROM attempt CROSS JOIN job ON job.number = attempt.job
+               WHERE attempt.job = $1 AND attempt.attempt = $2";
+    let found = query(sql).bind(lease.job).bind(lease.attempt);
+    let found: Option<(Option<String>, Option<f64>)> = found.fetch_optional(&mut *transaction).await?;
+    let (names, value) = found.unwrap_or_default();
     let mut label = label.clone();
-    if let Some(names) = names.flatten() {
+    label.details.ordered_by_value = value.is_some();
+    if let Some(names) = names {
         label.details.retry_adjustments = names.split(',').map(str::to_owned).collect();
     }
     Ok(label)

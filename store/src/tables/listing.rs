@@ -2,6 +2,7 @@
 //! depend on the number of rows.
 
 use super::label_row::LabelRow;
+use super::label_values::decode_factors;
 use crate::Store;
 use crate::checksum::{CANDIDATE, DECISION, Names, joined};
 use crate::database::{FromRow, SqlRow, query};
@@ -37,6 +38,8 @@ impl FromRow for ListedCandidate {
             job_state: row.get("job_state")?,
             priority: row.get("priority")?,
             attempts: row.get("attempts")?,
+            value: row.get("job_value")?,
+            value_factors: decode_factors(row.get::<Option<String>>("value_factors")?.as_deref())?,
             energy: label.as_ref().map(|label| label.energy),
             max_force: label.as_ref().map(Label::max_force),
             retry_adjustments: label.map(|label| label.details.retry_adjustments),
@@ -51,7 +54,8 @@ macro_rules! lines {
             joined!(candidate),
             ", ",
             joined!(decision),
-            ", coalesce(name, '') AS seed_name, job.state AS job_state, priority, attempts, label.* ",
+            ", coalesce(name, '') AS seed_name, job.state AS job_state, priority, attempts, job.value AS job_value,
+            value_factors, label.* ",
             $($rest),*
         )
     };
@@ -114,14 +118,15 @@ pub(crate) const OF_WALK: &str = page!("id >= $1 AND id < $1 || '~'", "id", "$2"
 /// decisions, are left out.
 pub(crate) const QUEUE: &str = lines!(
     "FROM (SELECT number AS place FROM job WHERE state = $1 AND priority <= $2
-              AND (priority < $2 OR decision > $3) AND decision < 1099511627776 ORDER BY priority DESC, decision LIMIT $4) AS page
+              AND (priority < $2 OR coalesce(value, -1) < $3 OR (coalesce(value, -1) = $3 AND decision > $4))
+              AND decision < 1099511627776 ORDER BY priority DESC, value DESC NULLS LAST, decision LIMIT $5) AS page
         CROSS JOIN job ON job.number = place
         CROSS JOIN candidate ON candidate.decision = job.decision
         CROSS JOIN decision ON sequence = candidate.decision
         LEFT JOIN label ON label.structure = candidate.structure AND label.protocol = job.protocol
             AND status = 'label'
         LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
-        ORDER BY job.priority DESC, job.decision"
+        ORDER BY job.priority DESC, job.value DESC NULLS LAST, job.decision"
 );
 
 impl Store {
@@ -133,7 +138,7 @@ impl Store {
         after: Option<ListCursor>,
         limit: u32,
     ) -> Result<Vec<ListedCandidate>> {
-        let ListCursor { value, decision } = after.unwrap_or(first(descending));
+        let ListCursor { value, decision, .. } = after.unwrap_or(first(descending));
         let query = match (order, descending) {
             (ListOrder::Decision, true) => query(NEWEST),
             (ListOrder::Decision, false) => query(OLDEST),
@@ -160,16 +165,17 @@ impl Store {
         query.bind(reason).bind(limit).fetch_all(&self.database).await
     }
 
-    /// Candidates whose jobs have a state, in the order in which they would be leased. `after` holds priority and
-    /// decision.
+    /// Candidates whose jobs have a state, in the order in which they would be leased: by priority, then by value, then in
+    /// decision order.
     pub async fn list_queue(
         &self,
         state: JobState,
-        after: Option<(i32, i64)>,
+        after: Option<ListCursor>,
         limit: u32,
     ) -> Result<Vec<ListedCandidate>> {
-        let (priority, decision) = after.unwrap_or((i32::MAX, 0));
-        let query = query(QUEUE).bind(state.name()).bind(priority).bind(decision);
+        let ListCursor { priority, value, decision } =
+            after.unwrap_or(ListCursor { decision: 0, ..first(true) });
+        let query = query(QUEUE).bind(state.name()).bind(priority).bind(value).bind(decision);
         query.bind(limit).fetch_all(&self.database).await
     }
 
@@ -187,7 +193,7 @@ impl Store {
 /// Before everything.
 fn first(descending: bool) -> ListCursor {
     match descending {
-        true => ListCursor { value: f64::MAX, decision: i64::MAX },
-        false => ListCursor { value: f64::MIN, decision: 0 },
+        true => ListCursor { priority: i32::MAX, value: f64::MAX, decision: i64::MAX },
+        false => ListCursor { priority: i32::MIN, value: f64::MIN, decision: 0 },
     }
 }

@@ -14,6 +14,7 @@ mod imports;
 pub mod job_counts;
 pub mod label_arrivals;
 pub mod label_row;
+pub mod label_values;
 mod labels;
 pub mod listing;
 pub mod logs;

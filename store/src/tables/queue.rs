@@ -19,9 +19,9 @@ use crate::jobs::{CalculationRecord, FailOutcome, LeaseStatus};
 use crate::processes::ProcessRecord;
 use crate::records::{JobState, Lease};
 
-/// The next job by priority, then in decision order.
+/// The next job by priority, then by value, then in decision order.
 pub(crate) const NEXT: &str = "SELECT number, structure, decision, attempts, failures, overruled FROM job
-    WHERE state = 'queued' AND protocol = $1 ORDER BY priority DESC, decision LIMIT 1";
+    WHERE state = 'queued' AND protocol = $1 ORDER BY priority DESC, value DESC NULLS LAST, decision LIMIT 1";
 
 pub(crate) const EXPIRED: &str = "SELECT number, holder FROM job WHERE state = 'leased' AND expires <= $1";
 
@@ -51,7 +51,8 @@ struct NextJob {
 from_columns!(NextJob { number, structure, decision, attempts, failures, overruled });
 
 impl Store {
-    /// Leases the next job of that protocol to `holder` (`process` or `process/part`), for `seconds` from `now` on.
+    /// Leases the next job of that protocol to `holder` (`process` or `process/part`), for `seconds` from `now` on: of the
+    /// highest priority, and of these the one of the largest value ([`Store::set_label_values`]) or the oldest.
     /// Returns `None` if the queue is empty or the campaign's budget ([`Store::set_budget`]) is used up.
     ///
     /// First, expired leases end and their jobs return to the queue; this does not count as a failed attempt. The

@@ -1,6 +1,6 @@
 //! Manual changes of the label queue. Each adds an entry to the operations log.
 
-use std::cmp::Reverse;
+use std::cmp::Ordering;
 use std::collections::BTreeMap;
 
 use serde_json::{Value, json};
@@ -9,6 +9,7 @@ use super::attempt_end::end_attempt;
 use super::exclude;
 use super::job_counts;
 use super::label_row::LabelRow;
+use super::label_values::decode_factors;
 use super::logs::insert_operation;
 use crate::Store;
 use crate::checksum::{CANDIDATE, Names, STRUCTURE, joined};
@@ -33,11 +34,11 @@ pub(crate) const LIST: &str = concat!(
     columns!(),
     "
     FROM (SELECT number AS place FROM job WHERE state = $1
-          ORDER BY priority DESC, decision LIMIT $2 OFFSET $3) AS page
+          ORDER BY priority DESC, value DESC NULLS LAST, decision LIMIT $2 OFFSET $3) AS page
     CROSS JOIN job ON job.number = place CROSS JOIN candidate ON candidate.decision = job.decision
     CROSS JOIN protocol ON protocol.number = job.protocol
     LEFT JOIN seed_structure ON seed = candidate.seed_structure
-    ORDER BY job.priority DESC, job.decision"
+    ORDER BY job.priority DESC, job.value DESC NULLS LAST, job.decision"
 );
 
 /// The imported structures of the same page.
@@ -46,7 +47,7 @@ pub(crate) const LIST_IMPORTS: &str = concat!(
     joined!(structure),
     "
     FROM (SELECT number AS place FROM job WHERE state = $1
-          ORDER BY priority DESC, decision LIMIT $2 OFFSET $3) AS page
+          ORDER BY priority DESC, value DESC NULLS LAST, decision LIMIT $2 OFFSET $3) AS page
     CROSS JOIN job ON job.number = place CROSS JOIN import ON import.structure = job.structure
         AND job.decision = 1099511627776 + import.number
     CROSS JOIN structure ON structure.number = job.structure
@@ -115,6 +116,8 @@ struct QueueRow {
     relative_volume: Option<f64>,
     overruled: bool,
     relabel: Option<String>,
+    value: Option<f64>,
+    value_factors: Option<String>,
 }
 
 impl FromRow for QueueRow {
@@ -144,6 +147,8 @@ impl FromRow for QueueRow {
             relative_volume: row.get("candidate__relative_volume")?,
             overruled: row.get_or_default::<Option<i64>>("overruled")?.is_some(),
             relabel: row.get_or_default("relabel")?,
+            value: row.get_or_default("value")?,
+            value_factors: row.get_or_default("value_factors")?,
         })
     }
 }
@@ -178,12 +183,14 @@ impl FromRow for ImportRow {
             relative_volume: None,
             overruled: row.get_or_default::<Option<i64>>("overruled")?.is_some(),
             relabel: row.get_or_default("relabel")?,
+            value: row.get_or_default("value")?,
+            value_factors: row.get_or_default("value_factors")?,
         }))
     }
 }
 
 impl Store {
-    /// Jobs in a state, in the order in which they would be leased: by priority, then in decision order. Without a
+    /// Jobs in a state, in the order in which they would be leased: by priority, then by value, then in decision order. Without a
     /// state, all jobs: leased first, then queued, failed, dropped and finished ones.
     pub async fn queue_list(
         &self,
@@ -204,7 +211,7 @@ impl Store {
                 let mut rows: Vec<QueueRow> = page(LIST).fetch_all(&mut transaction).await?;
                 let imports: Vec<ImportRow> = page(LIST_IMPORTS).fetch_all(&mut transaction).await?;
                 rows.extend(imports.into_iter().map(|ImportRow(row)| row));
-                rows.sort_by_key(|row| (Reverse(row.priority), row.decision));
+                rows.sort_by(QueueRow::by_lease);
                 let rows = rows.into_iter().map(|row| row.into_job(&excluded));
                 jobs.extend(rows.collect::<Result<Vec<_>>>()?);
             }
@@ -260,7 +267,7 @@ impl Store {
     pub async fn retry_job(&self, id: &str, now: i64) -> Result<String> {
         let allowed = [JobState::Failed, JobState::Dropped];
         let mut change = self.change("retry", id, &allowed, "failed and dropped").await?;
-        let sql = "UPDATE job SET failures = 0, overruled = 1, state = CASE WHEN EXISTS (
+        let sql = "UPDATE job SET failures = 0, overruled = 1, value = NULL, value_factors = NULL, state = CASE WHEN EXISTS (
                        SELECT 1 FROM label WHERE label.structure = job.structure
                        AND label.protocol = job.protocol AND status IN ('label', 'excluded')
                    ) THEN 'labelled' ELSE 'queued' END WHERE number = $1";
@@ -356,6 +363,14 @@ impl PendingChange {
 }
 
 impl QueueRow {
+    /// Order in which jobs of one state would be leased.
+    fn by_lease(&self, other: &Self) -> Ordering {
+        // Values are not negative.
+        let value = |row: &Self| row.value.unwrap_or(-1.0);
+        let by_priority = other.priority.cmp(&self.priority);
+        by_priority.then(value(other).total_cmp(&value(self))).then(self.decision.cmp(&other.decision))
+    }
+
     fn into_job(self, excluded: &BTreeMap<i64, String>) -> Result<QueueEntry> {
         Ok(QueueEntry {
             job: self.number,
@@ -379,6 +394,8 @@ impl QueueRow {
             relative_volume: self.relative_volume,
             overruled: self.overruled,
             relabel: self.relabel,
+            value: self.value,
+            value_factors: decode_factors(self.value_factors.as_deref())?,
             excluded: excluded.get(&self.number).cloned(),
         })
     }

@@ -47,7 +47,8 @@ macro_rules! request {
                 WHERE job.structure = structure.number AND job.state <> 'dropped')
             WHERE TRUE
             ON CONFLICT (structure, protocol) DO UPDATE SET state = 'queued', failures = 0, overruled = 1,
-                relabel = excluded.relabel, relabel_after = job.attempts WHERE job.state IN (",
+                relabel = excluded.relabel, relabel_after = job.attempts, value = NULL, value_factors = NULL
+                WHERE job.state IN (",
             $states,
             ")"
         )
@@ -71,7 +72,8 @@ const MOVE_JOBS: &str = "INSERT INTO job (structure, protocol, decision, priorit
             THEN 'labelled' ELSE 'queued' END, overruled, relabel, 0
         FROM job WHERE protocol <> $1 AND state IN ('queued', 'leased', 'failed')
     ON CONFLICT (structure, protocol) DO UPDATE SET state = 'queued', failures = 0, overruled = excluded.overruled,
-        relabel = excluded.relabel, relabel_after = job.attempts WHERE job.state = 'superseded'";
+        relabel = excluded.relabel, relabel_after = job.attempts, value = NULL, value_factors = NULL
+        WHERE job.state = 'superseded'";
 
 const SUPERSEDE_UNLABELLED: &str =
     "UPDATE job SET state = 'superseded', relabel = NULL, relabel_after = NULL, holder = NULL,

@@ -182,6 +182,7 @@ fn candidates(fates: &[(String, String, u64)], rejected_by_guards: u64) -> Candi
             "too_close" => declined.too_close += count,
             "budget" => declined.budget += count,
             "backlog" => declined.backlog += count,
+            "unlikely_to_complete" => declined.unlikely_to_complete += count,
             _ => {}
         }
     }

@@ -1,4 +1,4 @@
-//! Campaigns of versions 15 and 16, and the words of version 15.
+//! Campaigns of versions 15 to 17, and the words of version 15.
 
 use serde_json::json;
 use store::{Decision, Fate, Store, WalkRecord};
@@ -7,13 +7,25 @@ use wire::{Origin, WalkId};
 
 use super::{candidate, commit_of, name_of, protocol, walk};
 
+/// Turns the tables into those of version 17, without the number of the version.
+pub const TO_VERSION_17: &str = "DROP INDEX job_order;
+    ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
+    CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
+    DELETE FROM _sqlx_migrations WHERE version > 17";
+
 /// Turns the tables into those of version 16, without the number of the version.
-pub const TO_VERSION_16: &str = "DROP TABLE version_file; DROP TABLE version;
+pub const TO_VERSION_16: &str = "DROP INDEX job_order;
+    ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
+    CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
+    DROP TABLE version_file; DROP TABLE version;
     DELETE FROM _sqlx_migrations WHERE version > 16";
 
 /// Turns the tables with [`write_former_words`] into those of version 15, without the number of the version. The checksum
 /// of the candidate is unknown, since no program of this version writes its word.
 pub const TO_VERSION_15: &str = "
+    DROP INDEX job_order;
+    ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
+    CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
     DROP TABLE version_file; DROP TABLE version;
     UPDATE candidate SET reason = 'guard', checksum = -1 WHERE reason = 'too_close';
     UPDATE candidate_count SET fate = 'guard' WHERE fate = 'too_close';

@@ -446,9 +446,8 @@ fn label(results: &CalculationResults) -> Label {
             magnetic_moments: results.magnetic_moments.clone(),
             magnetisation: results.magnetisation,
             electronic_steps: results.electronic_steps,
-            // The store knows them.
+            // The store knows both.
             retry_adjustments: Vec::new(),
-            // The store says so.
             ordered_by_value: false,
         },
     }
