@@ -8,6 +8,7 @@ use clap::ValueEnum;
 use dft::abinit::AbinitSettings;
 use dft::ase::AseSettings;
 use dft::cp2k::Cp2kSettings;
+use dft::espresso::EspressoSettings;
 use dft::gpaw::GpawSettings;
 use dft::vasp::VaspSettings;
 
@@ -33,6 +34,8 @@ pub enum InitLabelKind {
     Command,
     /// CP2K
     Cp2k,
+    /// Quantum ESPRESSO
+    Espresso,
     /// GPAW
     Gpaw,
     /// A potential that calmwalk evaluates, such as another GRACE model
@@ -54,6 +57,7 @@ impl InitLabelKind {
             Self::Ase => "ase",
             Self::Command => "command",
             Self::Cp2k => "cp2k",
+            Self::Espresso => "espresso",
             Self::Gpaw => "gpaw",
             Self::Potential => "potential",
             Self::Vasp => "vasp",
@@ -67,6 +71,7 @@ impl InitLabelKind {
             Self::Ase => "Python file that defines calculator()",
             Self::Command => "script that reads structure.extxyz and writes label.extxyz",
             Self::Cp2k => "directory with BASIS_MOLOPT and GTH_POTENTIALS",
+            Self::Espresso => "directory of pseudopotentials, such as Si.UPF",
             Self::Gpaw => "directory of PAW setups",
             Self::Potential => "file of a potential (.npz, .eam.alloy, .eam.fs, .sw)",
             Self::Vasp => "directory of POTCAR files, such as Al_pv/POTCAR",
@@ -105,6 +110,11 @@ pub fn label_section(
         }
         InitLabelKind::Cp2k => {
             let defaults = Cp2kSettings::default();
+            let pseudopotentials = or_default(&defaults.pseudopotentials);
+            program_keys(kind, &defaults.command, Some(pseudopotentials), defaults.cutoff, defaults.k_spacing)
+        }
+        InitLabelKind::Espresso => {
+            let defaults = EspressoSettings::default();
             let pseudopotentials = or_default(&defaults.pseudopotentials);
             program_keys(kind, &defaults.command, Some(pseudopotentials), defaults.cutoff, defaults.k_spacing)
         }

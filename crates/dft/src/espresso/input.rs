@@ -63,10 +63,11 @@ fn copy(species: Species) -> String {
     format!("{species}.UPF")
 }
 
-/// Forces and stress, occupation numbers in the output, no other files.
+/// Forces and stress, and occupation numbers in the output. Wave functions, which `pw.x` leaves if it does not converge,
+/// go where nothing is kept.
 fn control() -> String {
     format!(
-        "&CONTROL\n  calculation = 'scf'\n  prefix = 'run'\n  outdir = './'\n  pseudo_dir = '{DATA_DIRECTORY}'\n  \
+        "&CONTROL\n  calculation = 'scf'\n  prefix = 'run'\n  outdir = '{DATA_DIRECTORY}'\n  pseudo_dir = '{DATA_DIRECTORY}'\n  \
          disk_io = 'none'\n  verbosity = 'high'\n  tprnfor = .true.\n  tstress = .true.\n/\n"
     )
 }
