@@ -76,7 +76,8 @@ impl UpfHeader {
             return Err(format!("is of type '{kind}', expected one of {}", KINDS.join(", ")));
         }
         if !is_pbe(functional) {
-            return Err(format!("is for the functional {}, not for PBE", functional.trim()));
+            let words = functional.split_whitespace().collect::<Vec<_>>().join(" ");
+            return Err(format!("is for the functional {words}, not for PBE"));
         }
         if *fully_relativistic {
             return Err("is fully relativistic; expected a scalar-relativistic one".to_owned());
@@ -152,7 +153,7 @@ mod tests {
             assert_ne!(file, SECOND);
             valence(&file, "B").unwrap_err()
         };
-        assert_eq!(wrong("PBX PBC", "PSX PSC"), "is for the functional SLA PW PSX PSC, not for PBE");
+        assert_eq!(wrong("PW PBX PBC", "PW   PSX  PSC"), "is for the functional SLA PW PSX PSC, not for PBE");
         assert_eq!(wrong(" SLA PW PBX PBC", "PBESOL"), "is for the functional PBESOL, not for PBE");
         assert_eq!(wrong("PAW", "1/r"), "is of type '1/r', expected one of NC, SL, US, USPP, PAW");
         let spinor = "is fully relativistic; expected a scalar-relativistic one";
