@@ -67,7 +67,7 @@ const fn range(
 }
 
 /// All ranges, by table.
-pub static RANGES: [Range; 107] = [
+pub static RANGES: [Range; 114] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
