@@ -93,7 +93,7 @@ fn values_that_only_the_user_has_are_refused_until_they_are_there() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     prepare(here);
-    for kind in ["abinit", "ase", "command", "cp2k", "gpaw", "vasp"] {
+    for kind in ["abinit", "ase", "command", "cp2k", "espresso", "gpaw", "vasp"] {
         let printed = succeed(here, options(kind, &[]));
         let text = written(here);
         let output = calmwalk(here, ["validate", CONFIG]);

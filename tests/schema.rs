@@ -174,6 +174,8 @@ fn the_schema_takes_and_refuses_what_the_program_does() {
         ("label.method", json!({ "abinit": { "pseudopotential_variants": { "Al": "Al.psp8" } } }), true),
         ("label.method", json!({ "abinit": { "cutoff": 10 } }), false),
         ("label.method", json!({ "abnit": {} }), false),
+        ("label.method", json!({ "espresso": { "pseudopotential_variants": { "Fe": "Fe.UPF" } } }), true),
+        ("label.method", json!({ "espresso": { "ecutwfc": 40 } }), false),
         ("label.method", vasp, true),
         ("stop.max_steps_without_structure", json!(1000), true),
         ("stop.max_steps_without_structure", json!(0), false),

@@ -193,7 +193,12 @@ fn names_that_are_nearly_right_get_a_hint() {
         (
             "method = { potential",
             "method = { quantum_espresso",
-            "makes labels through `ase`: see docs/dft-codes.md",
+            "Quantum ESPRESSO is `espresso`: see docs/dft-codes.md",
+        ),
+        (
+            "method = { potential",
+            "method = { siesta",
+            "siesta makes labels through `ase`: see docs/dft-codes.md",
         ),
     ] {
         tester.refused_with(from, to, &[expected]);

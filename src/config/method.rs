@@ -10,15 +10,12 @@ use toml::Spanned;
 
 use super::PotentialConfig;
 
+/// Other names of Quantum ESPRESSO.
+const ESPRESSO: [&str; 7] =
+    ["quantum_espresso", "quantumespresso", "quantum-espresso", "qe", "pwscf", "pw", "pw.x"];
+
 /// Names of programs that ASE has calculators for.
-const THROUGH_ASE: [&str; 27] = [
-    "quantum_espresso",
-    "quantumespresso",
-    "quantum-espresso",
-    "espresso",
-    "qe",
-    "pwscf",
-    "pw",
+const THROUGH_ASE: [&str; 20] = [
     "aims",
     "fhi_aims",
     "fhi-aims",
@@ -91,7 +88,10 @@ impl<'de> Visitor<'de> for Methods {
         if name != "potential" && !dft::DftSettings::NAMES.contains(&name.as_str()) {
             let names = dft::DftSettings::NAMES.join("`, `");
             let mut message = format!("unknown value `{name}`, expected one of `potential`, `{names}`");
-            if THROUGH_ASE.contains(&name.to_ascii_lowercase().as_str()) {
+            let known = name.to_ascii_lowercase();
+            if ESPRESSO.contains(&known.as_str()) {
+                message += "; Quantum ESPRESSO is `espresso`: see docs/dft-codes.md";
+            } else if THROUGH_ASE.contains(&known.as_str()) {
                 message += &format!("; {name} makes labels through `ase`: see docs/dft-codes.md");
             }
             return Err(A::Error::custom(message));

@@ -67,7 +67,7 @@ const fn range(
 }
 
 /// All ranges, by table.
-pub static RANGES: [Range; 107] = [
+pub static RANGES: [Range; 114] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -138,6 +138,13 @@ pub static RANGES: [Range; 107] = [
     range("label.method.abinit.energy_tolerance", "eV", [0.0, 10.0], [1e-12, 1e-2], ""),
     range("label.method.abinit.max_scf_steps", "", [0.0, 1e6], [10.0, 1e3], ""),
     range("label.method.abinit.vacuum", "Å", [0.0, 1e3], [3.0, 30.0], VACUUM),
+    range("label.method.espresso.cutoff", "eV", [20.0, 1e5], [100.0, 5e3], CUTOFF),
+    range("label.method.espresso.density_cutoff", "eV", [80.0, 1e6], [400.0, 5e4], CUTOFF),
+    range("label.method.espresso.k_spacing", "1/Å", [0.005, 5.0], [0.03, 1.5], K_SPACING),
+    range("label.method.espresso.smearing_width", "eV", [0.0, 20.0], [1e-3, 1.0], SMEARING),
+    range("label.method.espresso.energy_tolerance", "eV", [0.0, 10.0], [1e-12, 1e-2], ""),
+    range("label.method.espresso.max_scf_steps", "", [0.0, 1e6], [10.0, 1e3], ""),
+    range("label.method.espresso.vacuum", "Å", [0.0, 1e3], [3.0, 30.0], VACUUM),
     range("label.method.gpaw.cutoff", "eV", [20.0, 1e5], [100.0, 2e3], CUTOFF),
     range("label.method.gpaw.k_spacing", "1/Å", [0.005, 5.0], [0.03, 1.5], K_SPACING),
     range("label.method.gpaw.smearing_width", "eV", [0.0, 20.0], [1e-3, 1.0], SMEARING),

@@ -1,5 +1,5 @@
-//! A campaign whose labels are made by a real DFT code: `configs/silicon-dft.toml` with ABINIT (Debian's packages abinit and
-//! abinit-data).
+//! Campaigns whose labels are made by a real DFT code: `configs/silicon-dft.toml` with ABINIT, as it stands, and with Quantum
+//! ESPRESSO (Debian's packages abinit, abinit-data, quantum-espresso and quantum-espresso-data).
 //!
 //! cargo test --test external dft::
 
@@ -36,6 +36,16 @@ fn quick_demo() -> String {
     quick
 }
 
+/// The same by Quantum ESPRESSO.
+fn quick_espresso_demo() -> String {
+    const SECTION: &str =
+        "[label.method.espresso]\npseudopotential_variants = { Si = \"Si.pbe-rrkj.UPF\" }\n";
+    let abinit = quick_demo();
+    let text = abinit.replace("[label.method.abinit]\n", SECTION);
+    assert_ne!(text, abinit);
+    text
+}
+
 /// `label-file` makes the same label as the campaign.
 #[test]
 fn the_demo_makes_at_least_ten_dft_labels() {
@@ -62,17 +72,23 @@ fn the_demo_makes_at_least_ten_dft_labels() {
     assert_eq!(last.info["protocol"].text(), Some("abinit"));
 }
 
-fn is_abinit(command: &str) -> bool {
-    command.starts_with("abinit ")
+#[test]
+fn labels_survive_kills_of_labeller_runner_and_code() {
+    labels_survive_kills(&quick_demo(), "abinit ");
+}
+
+#[test]
+fn labels_survive_kills_with_quantum_espresso() {
+    labels_survive_kills(&quick_espresso_demo(), "pw.x ");
 }
 
 /// Labeller, runner and code are killed at random times: each label is made once, and no directory or process remains.
-#[test]
-fn labels_survive_kills_of_labeller_runner_and_code() {
+/// `code` is how the code's command line begins.
+fn labels_survive_kills(demo: &str, code: &str) {
     let directory = tempfile::tempdir().unwrap();
     let (here, scratch) = (directory.path(), directory.path().join("scratch"));
     fs::create_dir(&scratch).unwrap();
-    let text = quick_demo().replace("# max_per_walk = 3 ", "max_per_walk = 1 ");
+    let text = demo.replace("# max_per_walk = 3 ", "max_per_walk = 1 ");
     let label = format!("[label]\nscratch = \"{}\"\nmax_attempts = 20", scratch.display());
     fs::write(here.join("campaign.toml"), text.replace("[label]", &label)).unwrap();
     let mut run = program(here)
@@ -84,8 +100,9 @@ fn labels_survive_kills_of_labeller_runner_and_code() {
 
     for round in 0..6 {
         let begun = Instant::now();
-        wait_until("ABINIT is running", || {
-            calculation_processes(&scratch).iter().any(|(_, command)| is_abinit(command))
+        let is_code = |command: &str| command.starts_with(code);
+        wait_until("the code is running", || {
+            calculation_processes(&scratch).iter().any(|(_, command)| is_code(command))
                 || run.try_wait().unwrap().is_some()
         });
         if run.try_wait().unwrap().is_some() {
@@ -95,7 +112,7 @@ fn labels_survive_kills_of_labeller_runner_and_code() {
         let victim = match round % 3 {
             0 => calculation_processes(&scratch)
                 .into_iter()
-                .find(|(_, command)| is_abinit(command))
+                .find(|(_, command)| is_code(command))
                 .map(|(pid, _)| pid),
             1 => processes_running(here, "labeller").first().copied(),
             _ => processes_running(here, "calculation-runner").first().copied(),

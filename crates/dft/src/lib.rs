@@ -11,6 +11,7 @@ mod checks;
 pub mod command;
 pub mod cp2k;
 mod environment;
+pub mod espresso;
 mod executable;
 mod failure;
 pub mod gpaw;

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::{DftBackend, PassedEnvironment, SetupError, abinit, ase, command, cp2k, gpaw, vasp};
+use crate::{DftBackend, PassedEnvironment, SetupError, abinit, ase, command, cp2k, espresso, gpaw, vasp};
 
 /// Which program makes labels, with its settings: `[label.method.<name>]` of a campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -19,6 +19,8 @@ pub enum DftSettings {
     Command(command::CommandSettings),
     /// CP2K.
     Cp2k(cp2k::Cp2kSettings),
+    /// Quantum ESPRESSO.
+    Espresso(espresso::EspressoSettings),
     /// GPAW.
     Gpaw(gpaw::GpawSettings),
     /// VASP.
@@ -27,7 +29,7 @@ pub enum DftSettings {
 
 impl DftSettings {
     /// Names of the programs.
-    pub const NAMES: [&str; 6] = ["abinit", "ase", "command", "cp2k", "gpaw", "vasp"];
+    pub const NAMES: [&str; 7] = ["abinit", "ase", "command", "cp2k", "espresso", "gpaw", "vasp"];
 
     /// The program's name in the configuration.
     pub fn name(&self) -> &'static str {
@@ -36,6 +38,7 @@ impl DftSettings {
             Self::Ase(_) => "ase",
             Self::Command(_) => "command",
             Self::Cp2k(_) => "cp2k",
+            Self::Espresso(_) => "espresso",
             Self::Gpaw(_) => "gpaw",
             Self::Vasp(_) => "vasp",
         }
@@ -48,6 +51,7 @@ impl DftSettings {
             Self::Ase(settings) => vec![&mut settings.calculator],
             Self::Command(settings) => settings.files.iter_mut().collect(),
             Self::Cp2k(settings) => vec![&mut settings.pseudopotentials],
+            Self::Espresso(settings) => vec![&mut settings.pseudopotentials],
             Self::Gpaw(settings) => settings.pseudopotentials.iter_mut().collect(),
             Self::Vasp(settings) => settings.paths(),
         }
@@ -64,6 +68,7 @@ impl DftSettings {
             Self::Ase(settings) => Box::new(settings.prepare(passed)?),
             Self::Command(settings) => Box::new(settings.prepare()?),
             Self::Cp2k(settings) => Box::new(settings.prepare(passed)?),
+            Self::Espresso(settings) => Box::new(settings.prepare(passed)?),
             Self::Gpaw(settings) => Box::new(settings.prepare(passed)?),
             Self::Vasp(settings) => Box::new(settings.prepare()?),
         })

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::io::Read;
-use std::process::{Command, Stdio};
+use std::process::{Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 use crate::{PassedEnvironment, SetupError};
@@ -22,9 +22,43 @@ pub(crate) fn run(
     passed: &PassedEnvironment,
     files: &[(&str, &[u8])],
 ) -> Result<String, SetupError> {
-    let words = command.iter().map(String::as_str).chain(arguments.iter().copied());
-    let shown = words.collect::<Vec<_>>().join(" ");
-    let wrong = |reason: String| SetupError::Program { program: shown.clone(), reason };
+    let (status, stdout, stderr) = output(command, arguments, environment, passed, files)?;
+    if status.success() {
+        return Ok(stdout);
+    }
+    let mut lines = stdout.lines().chain(stderr.lines()).filter(|line| !line.trim().is_empty());
+    let last = lines.next_back().unwrap_or("nothing");
+    let reason = format!("{status}; its last output is: {last}");
+    Err(SetupError::Program { program: shown(command, arguments), reason })
+}
+
+/// As [`run`], without arguments and files, for a program that prints its version and then fails because it has no
+/// input.
+///
+/// # Errors
+/// [`SetupError::Program`] if it does not start or does not end.
+pub(crate) fn run_without_input(
+    command: &[String],
+    environment: &BTreeMap<String, String>,
+    passed: &PassedEnvironment,
+) -> Result<String, SetupError> {
+    output(command, &[], environment, passed, &[]).map(|(_, stdout, _)| stdout)
+}
+
+/// Command line for messages.
+fn shown(command: &[String], arguments: &[&str]) -> String {
+    command.iter().map(String::as_str).chain(arguments.iter().copied()).collect::<Vec<_>>().join(" ")
+}
+
+/// Status, standard output and standard error of a program.
+fn output(
+    command: &[String],
+    arguments: &[&str],
+    environment: &BTreeMap<String, String>,
+    passed: &PassedEnvironment,
+    files: &[(&str, &[u8])],
+) -> Result<(ExitStatus, String, String), SetupError> {
+    let wrong = |reason: String| SetupError::Program { program: shown(command, arguments), reason };
     let [program, first @ ..] = command else {
         return Err(wrong(
             "no command; name the program, as in command = [\"mpirun\", \"-np\", \"4\", \"abinit\"]".into(),
@@ -57,13 +91,7 @@ pub(crate) fn run(
             None => std::thread::sleep(Duration::from_millis(5)),
         }
     };
-    let (stdout, stderr) = (stdout.join().unwrap_or_default(), stderr.join().unwrap_or_default());
-    if status.success() {
-        return Ok(stdout);
-    }
-    let mut lines = stdout.lines().chain(stderr.lines()).filter(|line| !line.trim().is_empty());
-    let last = lines.next_back().unwrap_or("nothing");
-    Err(wrong(format!("{status}; its last output is: {last}")))
+    Ok((status, stdout.join().unwrap_or_default(), stderr.join().unwrap_or_default()))
 }
 
 /// Reads to the end, so that the program never blocks on a full pipe.

@@ -13,6 +13,8 @@ pub enum InitLabelKind {
     Command,
     /// CP2K
     Cp2k,
+    /// Quantum ESPRESSO
+    Espresso,
     /// GPAW
     Gpaw,
     /// A potential that calmwalk evaluates, such as another GRACE model
@@ -35,6 +37,7 @@ impl InitLabelKind {
             Self::Ase => "ase",
             Self::Command => "command",
             Self::Cp2k => "cp2k",
+            Self::Espresso => "espresso",
             Self::Gpaw => "gpaw",
             Self::Potential => "potential",
             Self::Vasp => "vasp",
@@ -48,6 +51,7 @@ impl InitLabelKind {
             Self::Ase => "Python file that defines calculator()",
             Self::Command => "script that reads structure.extxyz and writes label.extxyz",
             Self::Cp2k => "directory with BASIS_MOLOPT and GTH_POTENTIALS",
+            Self::Espresso => "directory of pseudopotentials, such as Si.UPF",
             Self::Gpaw => "directory of PAW setups",
             Self::Potential => "file of a potential (.npz, .eam.alloy, .eam.fs, .sw)",
             Self::Vasp => "directory of POTCAR files, such as Al_pv/POTCAR",

@@ -7,6 +7,7 @@ use atoms::Species;
 use dft::abinit::AbinitSettings;
 use dft::ase::AseSettings;
 use dft::cp2k::Cp2kSettings;
+use dft::espresso::EspressoSettings;
 use dft::gpaw::GpawSettings;
 use dft::vasp::VaspSettings;
 
@@ -53,6 +54,11 @@ pub fn label_section(
         }
         InitLabelKind::Cp2k => {
             let defaults = Cp2kSettings::default();
+            let pseudopotentials = or_default(&defaults.pseudopotentials);
+            program_keys(kind, &defaults.command, Some(pseudopotentials), defaults.cutoff, defaults.k_spacing)
+        }
+        InitLabelKind::Espresso => {
+            let defaults = EspressoSettings::default();
             let pseudopotentials = or_default(&defaults.pseudopotentials);
             program_keys(kind, &defaults.command, Some(pseudopotentials), defaults.cutoff, defaults.k_spacing)
         }

@@ -20,8 +20,8 @@ pub struct OwnCampaignArgs {
     /// What makes labels
     #[arg(long, value_name = "KIND")]
     pub label: Option<InitLabelKind>,
-    /// What the labels come from. potential: its file (.npz, .eam.alloy, .eam.fs, .sw), required; vasp, abinit, gpaw, cp2k: the
-    /// directory of pseudopotentials; ase: the Python file with calculator(); command: the script
+    /// What the labels come from. potential: its file (.npz, .eam.alloy, .eam.fs, .sw), required; vasp, abinit, gpaw, cp2k,
+    /// espresso: the directory of pseudopotentials; ase: the Python file with calculator(); command: the script
     #[arg(long, value_name = "PATH")]
     pub label_source: Option<PathBuf>,
     /// List every key, those with default values commented out

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use dft::{DftBackend, PassedEnvironment, abinit, cp2k, gpaw};
+use dft::{DftBackend, PassedEnvironment, abinit, cp2k, espresso, gpaw};
 use tempfile::TempDir;
 
 use crate::run::{calculate, label, prepared};
@@ -37,6 +37,21 @@ fn abinit_reads_copies() {
         let pseudopotentials = data.path().to_owned();
         let settings =
             abinit::AbinitSettings { pseudopotentials, cutoff: 200.0, k_spacing: 1.2, ..Default::default() };
+        needs_no_files(&settings.prepare(&PassedEnvironment::default()).unwrap(), data);
+    }
+}
+
+#[test]
+fn espresso_reads_copies() {
+    let norm_conserving = copies("/usr/share/espresso/pseudo", &["Si.pbe-rrkj.UPF"]);
+    let ultrasoft = copies("/usr/share/espresso/pseudo", &["Si.pbe-nl-rrkjus_psl.1.0.0.UPF"]);
+    for data in [norm_conserving, ultrasoft] {
+        let settings = espresso::EspressoSettings {
+            pseudopotentials: data.path().to_owned(),
+            cutoff: 200.0,
+            k_spacing: 1.2,
+            ..Default::default()
+        };
         needs_no_files(&settings.prepare(&PassedEnvironment::default()).unwrap(), data);
     }
 }
