@@ -85,6 +85,7 @@ impl FeatureCalculator {
     }
 
     /// The derivatives of a function of the last structure's features, from its cotangent, the derivatives with respect to them, [n × D].
+    /// Uses up what [`Self::compute`] left: once for each structure.
     pub fn pull_back(&mut self, cotangent: &[f64], out: &mut PullBack) {
         match self.hidden {
             Some(_) => self.grace.pull_back_hidden_layer(cotangent, out),

@@ -168,7 +168,10 @@ fn check_table(live: &Live) {
 fn check_candidate(live: &Live, id: &str) {
     let details = get(&live.address, &format!("/api/candidates/{id}")).json();
     let explained = succeed(live.here(), ["explain", "campaign", id, "--json"]);
-    assert_eq!(details, serde_json::from_str::<Value>(&explained).unwrap());
+    let mut explained: Value = serde_json::from_str(&explained).unwrap();
+    // It is computed from all labels, which is too slow for a page.
+    assert!(explained.as_object_mut().unwrap().remove("expected_errors").is_some());
+    assert!(details == explained, "{id}");
     let shown = get(&live.address, &format!("/api/candidates/{id}/structure")).json();
     let file = get(&live.address, &format!("/api/candidates/{id}/structure.extxyz"));
     assert!(file.head.contains(&format!("attachment; filename=\"{id}.extxyz\"")), "{}", file.head);

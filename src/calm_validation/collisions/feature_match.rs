@@ -55,11 +55,11 @@ impl<'a> FeatureMatch<'a> {
         self.target.len()
     }
 
-    /// Gradients of combinations of the features of the last environment by the coordinates of its m neighbours, `[weights × 3m]`, 1/Å.
-    pub fn combined_rows(&mut self, weights: &[Vec<f64>]) -> Vec<f64> {
-        let columns = 3 * self.calculator.features().len() / self.target.len();
-        let rows = combined_rows(self.calculator, weights);
-        rows.chunks_exact(columns).flat_map(|row| &row[3..]).copied().collect()
+    /// Gradients of combinations of the features of an atom by the coordinates of its m neighbours, `[weights × 3m]`, 1/Å. `None` without
+    /// features.
+    pub fn combined_rows(&mut self, neighbours: &[Vec3], weights: &[Vec<f64>]) -> Option<Vec<f64>> {
+        let rows = combined_rows(self.calculator, &cluster(self.species, neighbours), weights)?;
+        Some(rows.chunks_exact(3 + 3 * neighbours.len()).flat_map(|row| &row[3..]).copied().collect())
     }
 
     /// The function for the coordinates of the neighbours, `[3m]`, Å; writes its gradient, 1/Å. `None` without features.
