@@ -145,7 +145,7 @@ fn narrow(browser: &Browser, page: &str, id: &str) {
     for (name, is_there) in [
         ("candidates", "document.querySelectorAll('.candidates tbody tr').length > 2"),
         ("mixture", "document.querySelector('button.pick[aria-pressed=true]')"),
-        ("errors", "document.querySelectorAll('figure svg[role=img]').length === 2"),
+        ("errors", "document.querySelectorAll('figure svg[role=img]').length === 3"),
         ("hosts", "document.querySelector('main p, main table')"),
         (&format!("candidate/{id}"), "document.querySelectorAll('.atoms tbody tr').length > 20"),
         ("overview", "document.querySelectorAll('.tile').length === 5"),
@@ -208,7 +208,7 @@ fn table(browser: &Browser, page: &str) {
     assert_eq!(browser.run("return location.hash"), "#candidates/fate=accepted", "the page stays");
     browser.press(&[TAB]);
     assert_eq!(browser.run("return document.activeElement.tagName"), "SELECT", "the first filter");
-    let column = "[...document.querySelectorAll('.candidates tbody tr')].map((row) => Number(row.cells[5].textContent))";
+    let column = "[...document.querySelectorAll('.candidates tbody tr')].map((row) => Number(row.cells[6].textContent))";
     // Sort with the keyboard; the focus stays on the button.
     browser.run("document.querySelector('button.sort[data-keep=gamma]').focus()");
     browser.press(&[ENTER]);
