@@ -1,13 +1,13 @@
 """Compares both orders of labels by what a potential learns from the first of them.
 
-    python measure.py CALMWALK CAMPAIGN MODEL MIXTURE OLD [--seeds 0 1 2] [--epochs N] [--shares 0.25 0.5 0.75]
+    python measure.py CALMWALK CAMPAIGN MODEL MIXTURE OLD [--seeds 0 1 2] [--epochs N] [--shares 0.25 0.5 0.75] [--upfit OPTIONS…]
 
 CAMPAIGN is a finished campaign whose structures have all labels, run without [refit]; configs/aluminium.toml without its section
 [refit] makes one. MODEL and MIXTURE are those of its configuration, OLD is extended XYZ of old training data, which every training
 set has (the replay of a refit). The orders come from `cargo bench --bench label_order`, which holds out a random quarter of the walks for
 each seed. Failed calculations cost labels: the first 25 % are those of all calculations.
 
-Each training takes a fixed number of epochs, and its last weights: nothing is selected by the held-out labels. The held-out
+Each training takes a fixed number of epochs, with the options of `calmwalk upfit` behind `--upfit`, and its last weights: nothing is selected by the held-out labels. The held-out
 error is measured by another `upfit` of the trained model on the held-out labels, whose errors `before` are those of its model
 after the shift of each element was fitted. Prints a table of the held-out force MAE (eV/Å per component) by order, share and seed, and the
 mean over seeds.
@@ -62,7 +62,7 @@ def force_error(options, model, held_out, scratch):
 
 def train(options, data, output):
     run(options.calmwalk, "upfit", "--model", options.model, options.old, data, "--validation-share", 0,
-        "--epochs", options.epochs, "--output", output, "--json")
+        "--epochs", options.epochs, "--output", output, "--json", *options.upfit)
     return output
 
 
@@ -73,6 +73,7 @@ def main():
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--shares", type=float, nargs="+", default=[0.25, 0.5, 0.75])
     parser.add_argument("--epochs", type=int, default=100)
+    parser.add_argument("--upfit", nargs=argparse.REMAINDER, default=[])
     options = parser.parse_args()
     for name in ("calmwalk", "campaign", "model", "mixture", "old"):
         setattr(options, name, Path(getattr(options, name)).resolve())

@@ -154,3 +154,15 @@ pub enum SetupError {
         expected: String,
     },
 }
+
+impl SetupError {
+    /// No file for an element in the directory of pseudopotentials; `sought` are the names that would do.
+    pub(crate) fn missing_pseudopotential(species: Species, sought: &str, directory: &Path) -> Self {
+        let reason = format!(
+            "no {sought} in {}: get one for PBE and set `pseudopotentials` to its directory; if its \
+             name differs, set its file in `pseudopotential_variants`",
+            directory.display()
+        );
+        Self::Pseudopotential { species, reason }
+    }
+}

@@ -62,7 +62,7 @@ pub fn run(
         trainer.train_epoch(&mut state, &mut on_event)?;
     }
     let after = if stop() { None } else { trainer.errors_of_chosen(&state)? };
-    // Also at the end: whoever is killed before the model is in its file trains nothing again.
+    // Also at the end: a process that is killed before the model is in its file has nothing to train again.
     trainer.save(&state)?;
     Ok(after.map(|after| trainer.finish(state, after)))
 }

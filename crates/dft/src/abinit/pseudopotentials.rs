@@ -53,16 +53,9 @@ pub(super) fn missing(
     directory: &Path,
     pseudopotential_variants: &BTreeMap<Species, String>,
 ) -> SetupError {
-    let sought = pseudopotential_variants
-        .get(&species)
-        .cloned()
-        .unwrap_or_else(|| format!("{species}.psp8 or {species}.xml"));
-    let reason = format!(
-        "no {sought} in {}: get one for PBE and set `pseudopotentials` to its directory; if its \
-         name differs, set its file in `pseudopotential_variants`",
-        directory.display()
-    );
-    SetupError::Pseudopotential { species, reason }
+    let usual = || format!("{species}.psp8 or {species}.xml");
+    let sought = pseudopotential_variants.get(&species).cloned().unwrap_or_else(usual);
+    SetupError::missing_pseudopotential(species, &sought, directory)
 }
 
 fn read(species: Species, path: PathBuf) -> Result<Pseudopotential, SetupError> {

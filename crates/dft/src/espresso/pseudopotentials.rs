@@ -21,8 +21,8 @@ pub(super) struct UpfFile {
 /// What the directory has for an element: a pseudopotential, or why none is selected.
 pub(super) type SelectedUpf = Result<UpfFile, SetupError>;
 
-/// The pseudopotential of each element for which the directory has files. A file that nobody named may be for
-/// another functional, which matters only if a structure contains its element.
+/// The pseudopotential of each element for which the directory has files. A file that the settings do not
+/// name may be for another functional, which matters only if a structure contains its element.
 ///
 /// # Errors
 /// A directory that cannot be read, and each fault of a file that `pseudopotential_variants` names.
@@ -55,16 +55,9 @@ pub(super) fn missing(
     directory: &Path,
     pseudopotential_variants: &BTreeMap<Species, String>,
 ) -> SetupError {
-    let sought = pseudopotential_variants
-        .get(&species)
-        .cloned()
-        .unwrap_or_else(|| format!("{species}.UPF or {species}.*.UPF"));
-    let reason = format!(
-        "no {sought} in {}: get one for PBE and set `pseudopotentials` to its directory; if its \
-         name differs, set its file in `pseudopotential_variants`",
-        directory.display()
-    );
-    SetupError::Pseudopotential { species, reason }
+    let usual = || format!("{species}.UPF or {species}.*.UPF");
+    let sought = pseudopotential_variants.get(&species).cloned().unwrap_or_else(usual);
+    SetupError::missing_pseudopotential(species, &sought, directory)
 }
 
 /// Names of the UPF files in the directory, sorted.

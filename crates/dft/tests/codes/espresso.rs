@@ -89,8 +89,8 @@ fn another_program_and_other_pseudopotentials_are_refused_before_anything_runs()
     let echo = EspressoSettings { command: vec!["echo".into(), "hello".into()], ..settings() };
     let error = echo.prepare(&passed).unwrap_err().to_string();
     assert_eq!(error, "echo hello: is not pw.x: expected 'Program PWSCF v.…', found: hello");
-    let none = EspressoSettings { command: vec!["pw-of-nobody.x".into()], ..settings() };
-    assert!(none.prepare(&passed).unwrap_err().to_string().starts_with("pw-of-nobody.x: does not start ("));
+    let none = EspressoSettings { command: vec!["no-such-pw.x".into()], ..settings() };
+    assert!(none.prepare(&passed).unwrap_err().to_string().starts_with("no-such-pw.x: does not start ("));
     let lda = BTreeMap::from([("Al".parse().unwrap(), "Al.pz-vbc.UPF".to_owned())]);
     let lda = EspressoSettings { pseudopotential_variants: lda, ..settings() };
     let error = lda.prepare(&passed).unwrap_err().to_string();

@@ -146,7 +146,7 @@ fn patience_ends_a_training_that_gets_no_better() {
     assert_eq!((outcome.epoch, outcome.model.weights()), (0, model().weights()));
 }
 
-/// Whoever is killed before the model is in its file has lost nothing.
+/// A process that is killed before the model is in its file loses nothing.
 #[test]
 fn a_training_that_has_ended_makes_no_update_again() {
     let (data, settings) = (data(), settings());
