@@ -45,7 +45,6 @@ mod structure_files;
 mod summary;
 mod unlabelled_updates;
 mod upfit_run;
-mod version_updates;
 mod versions;
 mod web;
 mod wording;

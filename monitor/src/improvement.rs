@@ -21,11 +21,8 @@ impl Improvement {
     /// The improvement of the newest version. `None` if there is none, if it is an earlier one again, or if labels or errors to
     /// compare are missing.
     pub fn of_newest(versions: &[VersionRecord]) -> Option<Self> {
-        // An update of a mixture changes no error.
-        let has_errors = |version: &&VersionRecord| {
-            version.state == VersionState::Registered && version.method != VersionRecord::UPDATE
-        };
-        let newest = versions.iter().rfind(has_errors)?;
+        let is_registered = |version: &&VersionRecord| version.state == VersionState::Registered;
+        let newest = versions.iter().rfind(is_registered)?;
         if newest.method == VersionRecord::ROLLBACK {
             return None;
         }
@@ -49,7 +46,9 @@ impl Improvement {
 
 /// The versions that were trained, without refused attempts and rollbacks, by number.
 pub fn trained_versions(versions: &[VersionRecord]) -> impl Iterator<Item = &VersionRecord> {
-    versions.iter().filter(|version| version.state == VersionState::Registered && version.is_of_training())
+    versions.iter().filter(|version| {
+        version.state == VersionState::Registered && version.method != VersionRecord::ROLLBACK
+    })
 }
 
 /// Mean absolute errors of the forces of a version's parent and its own, eV/Å: on the labels held out, or their means over the test
@@ -110,9 +109,6 @@ pub(crate) mod tests {
         assert_eq!(per_100_labels(&[first.clone(), refused]), Some(0.25));
         let none_more = VersionRecord { labels: 200, ..second.clone() };
         assert_eq!(per_100_labels(&[first.clone(), none_more]), None);
-        let update = VersionRecord { number: 3, method: VersionRecord::UPDATE.into(), ..second.clone() };
-        let versions = [first.clone(), second.clone(), update];
-        assert_eq!((per_100_labels(&versions), trained_versions(&versions).count()), (Some(-2.0), 2));
         let rollback = VersionRecord { method: VersionRecord::ROLLBACK.into(), ..second };
         let versions = [first, rollback];
         assert_eq!((per_100_labels(&versions), trained_versions(&versions).count()), (None, 1));

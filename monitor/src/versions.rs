@@ -35,7 +35,7 @@ pub struct VersionSummary {
     pub state: VersionStanding,
     /// The version from which it was trained; `None` for version 0.
     pub parent: Option<u32>,
-    /// How it was made: `configuration`, `native`, `command`, `rollback`, `update`.
+    /// How it was made: `configuration`, `native`, `command`, `rollback`.
     pub method: String,
     /// Why it was refused; empty if it was not.
     pub reason: String,
@@ -288,7 +288,8 @@ fn summaries(
 
 /// Version 0. Its errors are those of the parent of the first attempt from it.
 fn first(records: &[VersionRecord]) -> VersionSummary {
-    let from_it = records.iter().find(|record| record.parent == 0 && record.is_of_training());
+    let from_it =
+        records.iter().find(|record| record.parent == 0 && record.method != VersionRecord::ROLLBACK);
     let errors = from_it.map(|record| errors_of(&record.figures)).unwrap_or_default();
     let errors = errors.into_iter().filter(|set| set.parent.is_some());
     VersionSummary {

@@ -81,7 +81,7 @@ impl RefitSchedule {
     /// Whether the campaign ends with the newest version: no walk starts with it, unless some have before that was known.
     pub fn is_newest_without_walks(&self) -> bool {
         let is_last = |newest: &VersionRecord| {
-            newest.is_of_training() && (self.is_converged() || self.are_all_trained())
+            newest.method != VersionRecord::ROLLBACK && (self.is_converged() || self.are_all_trained())
         };
         self.newest().is_some_and(|newest| newest.number > self.taken_up && is_last(newest))
     }

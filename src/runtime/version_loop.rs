@@ -4,12 +4,10 @@
 
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Instant;
 
 use orchestrator::reactor::RunOutcome;
 use orchestrator::selector::{CampaignMode, Selector, SelectorSettings, SelectorSnapshot};
-use serde_json::Value;
-use store::{Store, VersionFiles, VersionRecord, unix_milliseconds};
+use store::Store;
 use tokio_util::sync::CancellationToken;
 
 use super::refit_process::RefitProcess;
@@ -18,10 +16,9 @@ use super::{RunContext, RunMode, STOP_MESSAGE, run_walks};
 use crate::campaign::LoadedCampaign;
 use crate::config::RefitSection;
 use crate::exit_status::CommandError;
-use crate::output::{count, log_and_print};
+use crate::output::log_and_print;
 use crate::refit::schedule::RefitSchedule;
 use crate::signals::cancel_on_signal;
-use crate::version_updates::{read, updated_artifact};
 use crate::versions::VersionOnDisk;
 
 /// Runs the campaign until it is finished or stopped. `run` and `selector` are those of the version in force.
@@ -109,72 +106,9 @@ pub async fn in_force(
     let Some(record) = schedule.in_force().filter(|found| found.number != campaign.version_number()) else {
         return Ok(campaign.clone());
     };
-    let (mut number, found) = (record.number, VersionOnDisk::find(store, record, directory).await?);
-    let mut versioned = campaign.with_version(found)?;
-    if campaign.config.campaign.mode == CampaignMode::Live
-        && number > schedule.taken_up
-        && let Some(updated) = with_updated_mixture(&versioned, store, record).await?
-    {
-        number = updated.number;
-        versioned = campaign.with_version(VersionOnDisk::find(store, &updated, directory).await?)?;
-    }
-    log_and_print(format_args!("version {number} of the potential is in force"));
-    Ok(versioned)
-}
-
-/// Registers the version before it is taken up once more, with its mixture updated by what walks have found since it was built. `None`
-/// if nothing updates it. `campaign` is the one with this version, without walks.
-///
-/// A version never changes, so replay and exports find the mixture with which its walks begin in a file.
-async fn with_updated_mixture(
-    campaign: &LoadedCampaign,
-    store: &Store,
-    record: &VersionRecord,
-) -> Result<Option<VersionRecord>, CommandError> {
-    if record.method == VersionRecord::UPDATE {
-        return Ok(None);
-    }
-    let (begun, path) = (Instant::now(), campaign.mixture_file()?.path);
-    let load = || Ok((Arc::clone(&campaign.model), campaign.artifact.clone()));
-    let updated =
-        updated_artifact(store, &path, record.last_decision, load, &CancellationToken::new()).await?;
-    let Some((mixture, updates)) = updated.filter(|(_, updates)| updates.applied > 0) else {
-        return Ok(None);
-    };
-    let files = VersionFiles { model: read(&campaign.model_files()?.export.path)?, mixture };
-    let versions = store.versions().await?;
-    let updated = VersionRecord {
-        number: versions.last().map_or(1, |last| last.number.saturating_add(1)),
-        parent: record.number,
-        method: VersionRecord::UPDATE.to_owned(),
-        mixture_hash: blake3::hash(&files.mixture).to_string(),
-        figures: figures_as_parent(&record.figures),
-        seconds: begun.elapsed().as_secs_f64(),
-        core_hours: 0.0,
-        time: unix_milliseconds(),
-        ..record.clone()
-    };
-    store.add_version(&updated, Some(&files)).await?;
-    log_and_print(format_args!(
-        "version {}: version {} with {} more in its mixture, which walks have found since it was built",
-        updated.number,
-        record.number,
-        count(updates.applied, "structure")
-    ));
-    Ok(Some(updated))
-}
-
-/// The figures of a version whose parent has the same model: the errors of both are the same.
-fn figures_as_parent(figures: &Value) -> Value {
-    let mut figures = figures.clone();
-    for set in figures.get_mut("sets").and_then(Value::as_array_mut).into_iter().flatten() {
-        if let Some(set) = set.as_object_mut()
-            && let Some(errors) = set.get("version").cloned()
-        {
-            set.insert("parent".to_owned(), errors);
-        }
-    }
-    figures
+    let found = VersionOnDisk::find(store, record, directory).await?;
+    log_and_print(format_args!("version {} of the potential is in force", record.number));
+    Ok(campaign.with_version(found)?)
 }
 
 /// The selector with the state in the store. New walks are started.
@@ -214,21 +148,4 @@ async fn refit_at(campaign: &LoadedCampaign, store: &Store) -> Result<Option<u32
     }
     let number = schedule.refit_at(refit);
     Ok(number.map(|number| number.min(u32::MAX.into()) as u32))
-}
-
-#[cfg(test)]
-mod tests {
-    use serde_json::json;
-
-    use super::*;
-
-    #[test]
-    fn the_same_model_has_the_errors_of_its_parent() {
-        let figures =
-            json!({ "sets": [{ "name": "seed", "parent": 2, "version": 1 }, "of another program"] });
-        let expected =
-            json!({ "sets": [{ "name": "seed", "parent": 1, "version": 1 }, "of another program"] });
-        assert_eq!(figures_as_parent(&figures), expected);
-        assert_eq!(figures_as_parent(&Value::Null), Value::Null);
-    }
 }

@@ -74,13 +74,6 @@ pub struct VersionFiles {
 impl VersionRecord {
     /// [`Self::method`] of a version that is an earlier one again.
     pub const ROLLBACK: &str = "rollback";
-    /// [`Self::method`] of a version that is its parent with an updated mixture.
-    pub const UPDATE: &str = "update";
-
-    /// Whether it has a model of its own, which was trained.
-    pub fn is_of_training(&self) -> bool {
-        ![Self::ROLLBACK, Self::UPDATE].contains(&self.method.as_str())
-    }
 }
 
 /// Which version of the potential drives each walk. Walks of a version have higher numbers than those of the versions before:

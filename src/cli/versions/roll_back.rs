@@ -1,23 +1,31 @@
 //! `calmwalk versions … roll-back`
 
-use std::io::{self, Write};
+use std::fs;
+use std::io::{self, Cursor, Write};
+use std::path::Path;
 use std::time::Instant;
 
+use calm::build::ArtifactVersion;
 use orchestrator::selector::CampaignMode;
 use serde_json::json;
-use store::{CampaignLock, Location, Store, VersionFiles, VersionRecord, VersionState, unix_milliseconds};
+use store::{
+    CampaignLock, Fate, Location, Store, VersionFiles, VersionRecord, VersionState, unix_milliseconds,
+};
 use tokio_util::sync::CancellationToken;
 
 use super::errors::figures_of_same_model;
 use super::files::VersionSource;
 use super::{CommandError, ExitStatus, KnownVersions, block_on, registered};
+use crate::mixture_files::open;
 use crate::output::{count, print, print_json, warn_if_unencrypted};
 use crate::replay::RelocatedFilesArgs;
 use crate::signals::stop_token;
-use crate::version_updates::{MixtureUpdates, read, updated_artifact};
+use crate::unlabelled_updates;
 
 /// The name of the lock holder in messages of other processes.
 const HOLDER: &str = "calmwalk versions roll-back";
+/// Candidates per read.
+const CANDIDATES: u32 = 16;
 
 /// Go back to an earlier version: register its files as a new version
 ///
@@ -41,7 +49,15 @@ struct RolledBack {
     number: u32,
     mode: CampaignMode,
     /// What the structures accepted since did to the mixture.
-    updates: MixtureUpdates,
+    updates: Updates,
+}
+
+/// Number of structures by what they did to the mixture.
+#[derive(Clone, Copy, Default)]
+struct Updates {
+    applied: u64,
+    covered: u64,
+    left_out: u64,
 }
 
 impl VersionsRollBackArgs {
@@ -52,7 +68,7 @@ impl VersionsRollBackArgs {
             return Ok(ExitStatus::Interrupted);
         };
         if json {
-            let MixtureUpdates { applied, covered, left_out } = done.updates;
+            let Updates { applied, covered, left_out } = done.updates;
             let candidates = json!({ "applied": applied, "covered": covered, "left_out": left_out });
             print_json(&json!({ "version": done.number, "parent": self.number, "candidates": candidates }))?;
         } else {
@@ -94,9 +110,9 @@ impl VersionsRollBackArgs {
         let source = (number > 0).then(|| registered(versions, number)).transpose()?;
         let last_decision = source.map_or(0, |source| source.last_decision);
         let files = VersionSource::find(store, number, &self.moved).await?;
-        let load = || Ok((files.model_files()?.load()?, files.artifact()?));
-        let updated = updated_artifact(store, &files.mixture.path, last_decision, load, stop).await?;
-        let Some((mixture, updates)) = updated else { return Ok(None) };
+        let Some((mixture, updates)) = mixture(store, &files, last_decision, stop).await? else {
+            return Ok(None);
+        };
         let files = VersionFiles { model: read(&files.model.path)?, mixture };
         let record = VersionRecord {
             number: versions.last().map_or(1, |last| last.number.saturating_add(1)),
@@ -139,10 +155,54 @@ fn refuse_newest(known: &KnownVersions, number: u32) -> Result<(), CommandError>
     }
 }
 
+/// The artifact of a version, updated with what the campaign has accepted after this decision. `None` after a cancellation of
+/// `stop`.
+async fn mixture(
+    store: &Store,
+    files: &VersionSource,
+    after: i64,
+    stop: &CancellationToken,
+) -> Result<Option<(Vec<u8>, Updates)>, CommandError> {
+    let path = &files.mixture.path;
+    if !has_accepted(store, after).await? {
+        return Ok(Some((read(path)?, Updates::default())));
+    }
+    let (model, original) = (files.model_files()?.load()?, files.artifact()?);
+    let covered = (1..=after).collect();
+    let found =
+        unlabelled_updates::apply_others(store, &model, original.mixture.clone(), &covered, stop).await?;
+    let Some(found) = found else { return Ok(None) };
+    let updates = Updates { applied: found.applied, covered: found.covered, left_out: found.left_out };
+    if updates.applied == 0 {
+        return Ok(Some((read(path)?, updates)));
+    }
+    let version =
+        ArtifactVersion::new(path, &original.mixture, &found.mixture).map_err(CommandError::failed)?;
+    let out = version.write_artifact(open(path)?, Cursor::new(Vec::new()), &found.campaign);
+    Ok(Some((out.map_err(CommandError::failed)?.into_inner(), updates)))
+}
+
+/// Whether a structure of a biased walk was accepted after this decision.
+async fn has_accepted(store: &Store, after: i64) -> Result<bool, CommandError> {
+    let mut last = after;
+    loop {
+        let page = store.candidates(last, false, CANDIDATES).await?;
+        if page.iter().any(|candidate| candidate.fate == Fate::Accepted) {
+            return Ok(true);
+        }
+        let Some(end) = page.last() else { return Ok(false) };
+        last = end.decision;
+    }
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, CommandError> {
+    fs::read(path).map_err(|error| CommandError::Failed(format!("cannot read {}: {error}", path.display())))
+}
+
 impl RolledBack {
     fn write(&self, out: &mut dyn Write, again: u32) -> io::Result<()> {
         let Self { number, mode, updates } = self;
-        let MixtureUpdates { applied, covered, left_out } = *updates;
+        let Updates { applied, covered, left_out } = *updates;
         writeln!(out, "registered version {number}: version {again} again")?;
         let all = applied + covered + left_out;
         if all > 0 {
