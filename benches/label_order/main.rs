@@ -112,7 +112,10 @@ impl Recording {
         let walks = self.store.load_walks().await?;
         let pair = |walk: &store::WalkRecord| walk.partner.unwrap_or(walk.walk).0;
         let pairs: BTreeSet<u32> = walks.iter().map(pair).collect();
-        let left_out: BTreeSet<u32> = pairs.into_iter().filter(|pair| uniform(seed, *pair) < share).collect();
+        let number = ((share * pairs.len() as f64).round() as usize).max(1);
+        let mut drawn: Vec<u32> = pairs.into_iter().collect();
+        drawn.sort_by(|a, b| uniform(seed, *a).total_cmp(&uniform(seed, *b)));
+        let left_out: BTreeSet<u32> = drawn.into_iter().take(number).collect();
         let pairs: HashMap<u32, u32> = walks.iter().map(|walk| (walk.walk.0, pair(walk))).collect();
         let jobs = self.store.queue_list(None, u32::MAX, 0).await?;
         let is_left_out = |walk: &u32| pairs.get(walk).is_some_and(|pair| left_out.contains(pair));

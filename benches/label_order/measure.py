@@ -7,10 +7,10 @@ CAMPAIGN is a finished campaign whose structures have all labels, run without [r
 set has (the replay of a refit). The orders come from `cargo bench --bench label_order`, which holds out a random quarter of the walks for
 each seed. Failed calculations cost labels: the first 25 % are those of all calculations.
 
-Each training takes a fixed number of epochs, with the options of `calmwalk upfit` behind `--upfit`, and its last weights: nothing is selected by the held-out labels. The held-out
-error is measured by another `upfit` of the trained model on the held-out labels, whose errors `before` are those of its model
-after the shift of each element was fitted. Prints a table of the held-out force MAE (eV/Å per component) by order, share and seed, and the
-mean over seeds.
+Each training takes a fixed number of epochs, with the options of `calmwalk upfit` behind `--upfit`, and its last weights: nothing is
+selected by the held-out labels. The held-out error is measured by another `upfit` of the trained model on the held-out labels, whose
+errors `before` are those of its model after the shift of each element was fitted. Prints a table of the held-out force MAE (eV/Å per
+component) by order, share and seed, and the mean over seeds.
 """
 
 import argparse
