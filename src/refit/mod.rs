@@ -407,7 +407,7 @@ impl Refit<'_> {
             parent: self.config.parent_version,
             state: if is_refused { VersionState::Refused } else { VersionState::Registered },
             // The directory is removed, and the record must not depend on where the campaign is.
-            reason: without_directory(&reason.unwrap_or_default(), &self.directory),
+            reason: with_file_names_only(&reason.unwrap_or_default(), &self.directory),
             method: self.config.settings.method.name().to_owned(),
             structures: self.set.accepted,
             last_decision: self.set.last_decision,
@@ -440,7 +440,7 @@ impl Refit<'_> {
 }
 
 /// A message that names the files of this directory by their names.
-fn without_directory(message: &str, directory: &Path) -> String {
+fn with_file_names_only(message: &str, directory: &Path) -> String {
     message.replace(&format!("{}/", directory.display()), "")
 }
 

@@ -1,8 +1,9 @@
 //! The comparison of biased walks with their controls, in words.
 
+use atoms::units::GPA_PER_EV_A3;
 use monitor::label_statistics::comparison::{
-    ConfidenceEstimate, MIN_UNITS, PairCounts, PairedErrors, PairedTests, ResampledUnit, ResamplingUnits,
-    WalkComparison,
+    ComparedGroup, ConfidenceEstimate, ElementRanking, MIN_UNITS, PairCounts, PairedErrors, PairedQuantity,
+    PairedTests, ResampledUnit, ResamplingUnits, WalkComparison,
 };
 
 use crate::output::{count, decimals};
@@ -122,6 +123,49 @@ fn sampled(comparison: &WalkComparison) -> Option<String> {
             "the comparison is of samples: {sampled_structures} of {structures} structures, {sampled_atoms} of {atoms} atoms"
         )
     })
+}
+
+/// An error over the pairs with its name and unit, the factor to this unit, and the number of decimals.
+pub type ShownError<'a> = (&'static str, &'a PairedQuantity, f64, usize);
+
+/// The errors that are known of any pairs.
+pub fn known_errors(pairs: &PairedErrors) -> Vec<ShownError<'_>> {
+    let mut all = vec![
+        ("force MAE (eV/Å)", &pairs.force_mae, 1.0, 3),
+        ("mean |ΔF| (eV/Å)", &pairs.mean_force_error, 1.0, 3),
+        ("energy error (meV/atom)", &pairs.energy, 1000.0, 1),
+        ("stress error (GPa)", &pairs.stress, GPA_PER_EV_A3, 3),
+    ];
+    all.retain(|(_, quantity, ..)| quantity.pairs > 0);
+    all
+}
+
+/// The groups with structures by name: matched, then pooled.
+pub fn groups(comparison: &WalkComparison) -> Vec<(&'static str, &ComparedGroup)> {
+    let (matched, pooled) = (&comparison.matched, &comparison.pooled);
+    let mut all = vec![
+        ("matched biased", &matched.biased),
+        ("matched control", &matched.control),
+        ("pooled all", &pooled.all),
+        ("pooled biased", &pooled.biased),
+        ("pooled control", &pooled.control),
+    ];
+    all.retain(|(_, group)| group.structures > 0);
+    all
+}
+
+/// The elements of matched structures and of all, with the name of their group; none if all groups have one element.
+pub fn elements(comparison: &WalkComparison) -> Vec<(&'static str, &ElementRanking)> {
+    let mut groups = groups(comparison);
+    groups.retain(|(name, _)| name.starts_with("matched") || *name == "pooled all");
+    if groups.iter().all(|(_, group)| group.elements.len() < 2) {
+        return Vec::new();
+    }
+    let mut all: Vec<_> =
+        groups.iter().flat_map(|(name, group)| group.elements.iter().map(move |of| (*name, of))).collect();
+    // Stable: the groups of an element stay in order.
+    all.sort_by_key(|(_, of)| of.element);
+    all
 }
 
 /// The numbers of pairs in which either side is larger, `60 of 71`.

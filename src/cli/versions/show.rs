@@ -10,8 +10,8 @@ use store::{Location, Store, VersionRecord};
 use super::errors::{UNKNOWN, table, with_parent};
 use super::list::{first_to_json, record_to_json};
 use super::{CommandError, ExitStatus, KnownVersions};
+use crate::calibration_file::GradeFiles;
 use crate::output::{TextTable, count, decimals, print, print_json};
-use crate::replay::{ARTIFACT, MODEL, resolved};
 use crate::wording::cost::wall_time;
 use crate::wording::date;
 
@@ -50,17 +50,11 @@ impl VersionsShowArgs {
 impl ShownVersion {
     async fn read(store: &Store, number: u32) -> Result<Self, CommandError> {
         let known = KnownVersions::read(store).await?;
-        let hashes = match number {
-            0 => {
-                let configuration = resolved(&store.campaign().await?)?;
-                [MODEL, ARTIFACT]
-                    .map(|key| configuration["files"][key].as_str().unwrap_or_default().to_owned())
-            }
-            number => {
-                let record = super::numbered(&known.versions, number)?;
-                [record.model_hash.clone(), record.mixture_hash.clone()]
-            }
-        };
+        if number > 0 {
+            super::numbered(&known.versions, number)?;
+        }
+        let GradeFiles { model_hash, mixture_hash } = GradeFiles::of_version(store, number).await?;
+        let hashes = [model_hash, mixture_hash.unwrap_or_default()];
         Ok(Self { number, known, hashes, finds: VersionFinds::read(store, number).await? })
     }
 

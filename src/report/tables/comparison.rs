@@ -1,13 +1,13 @@
 //! Biased walks compared with their controls.
 
-use analysis::{ERROR_THRESHOLDS, threshold_place};
-use atoms::units::GPA_PER_EV_A3;
+use analysis::ERROR_THRESHOLDS;
 use monitor::label_statistics::LARGE_FORCE_ERROR;
 use monitor::label_statistics::comparison::{
-    ComparedGroup, ConfidenceEstimate, PairedErrors, PairedQuantity, WalkComparison,
+    ConfidenceEstimate, PairedErrors, PairedQuantity, WalkComparison,
 };
 
 use super::{PageTable, TableCell, count, real, text};
+use crate::wording::comparison as wording;
 use crate::wording::comparison::{intervals, larger, probability};
 
 /// Title of a column of intervals.
@@ -26,21 +26,6 @@ pub fn all(comparison: &WalkComparison) -> [PageTable; 7] {
     ]
 }
 
-/// An error over the pairs, with its unit, the factor to this unit, and the number of decimals.
-type ShownError<'a> = (&'static str, &'a PairedQuantity, f64, usize);
-
-/// The errors that are known of any pairs.
-fn known(pairs: &PairedErrors) -> Vec<ShownError<'_>> {
-    let mut all = vec![
-        ("force MAE (eV/Å)", &pairs.force_mae, 1.0, 3),
-        ("mean |ΔF| (eV/Å)", &pairs.mean_force_error, 1.0, 3),
-        ("energy (meV/atom)", &pairs.energy, 1000.0, 1),
-        ("stress (GPa)", &pairs.stress, GPA_PER_EV_A3, 3),
-    ];
-    all.retain(|(_, quantity, ..)| quantity.pairs > 0);
-    all
-}
-
 /// Errors over the pairs.
 fn pairs(comparison: &WalkComparison) -> PageTable {
     let caption = format!(
@@ -51,7 +36,7 @@ fn pairs(comparison: &WalkComparison) -> PageTable {
         intervals(&comparison.pairs.units, comparison)
     );
     let mut table = PageTable::new("pairs", &caption, &["error", "of", "pairs", "median", INTERVAL]);
-    for (name, quantity, factor, digits) in known(&comparison.pairs) {
+    for (name, quantity, factor, digits) in wording::known_errors(&comparison.pairs) {
         let PairedQuantity { biased, control, difference_of_medians, median_difference, .. } = quantity;
         for (of, estimate) in [
             ("biased", biased),
@@ -82,7 +67,7 @@ fn tests(pairs: &PairedErrors) -> PageTable {
         "sign test p",
     ];
     let mut table = PageTable::new("pair-tests", caption, &titles);
-    for (name, quantity, ..) in known(pairs) {
+    for (name, quantity, ..) in wording::known_errors(pairs) {
         let mut row = vec![text(name)];
         for tests in [&quantity.tests, &quantity.tests_by_unit] {
             row.push(text(larger(tests)));
@@ -120,24 +105,10 @@ fn unpaired(pairs: &PairedErrors) -> PageTable {
     ];
     for (name, range) in ranges {
         if let Some(range) = range {
-            table.rows.push(vec![text(name), text(crate::wording::comparison::median_range(range, 3))]);
+            table.rows.push(vec![text(name), text(wording::median_range(range, 3))]);
         }
     }
     table
-}
-
-/// The groups with structures: matched, then pooled.
-fn named(comparison: &WalkComparison) -> Vec<(&'static str, &ComparedGroup)> {
-    let (matched, pooled) = (&comparison.matched, &comparison.pooled);
-    let mut all = vec![
-        ("matched biased", &matched.biased),
-        ("matched control", &matched.control),
-        ("pooled all", &pooled.all),
-        ("pooled biased", &pooled.biased),
-        ("pooled control", &pooled.control),
-    ];
-    all.retain(|(_, group)| group.structures > 0);
-    all
 }
 
 fn groups(comparison: &WalkComparison) -> PageTable {
@@ -161,7 +132,7 @@ fn groups(comparison: &WalkComparison) -> PageTable {
         INTERVAL,
     ];
     let mut table = PageTable::new("comparison", &caption, &titles);
-    for (name, group) in named(comparison) {
+    for (name, group) in wording::groups(comparison) {
         let mut row = vec![
             text(name),
             count(group.structures),
@@ -186,13 +157,11 @@ fn ranks(comparison: &WalkComparison) -> PageTable {
     );
     let titles = ["", "grade", "sampled atoms", "ρ", INTERVAL, "ROC-AUC", INTERVAL];
     let mut table = PageTable::new("comparison-ranks", &caption, &titles);
-    let large = threshold_place(LARGE_FORCE_ERROR);
-    for (name, group) in named(comparison) {
+    for (name, group) in wording::groups(comparison) {
         for (grade, ranking) in [("γ", &group.gamma), ("γ_nbr", &group.gamma_nbr)] {
-            let area = large.and_then(|place| ranking.roc_auc.get(place)).copied().unwrap_or_default();
             let mut row = vec![text(name), text(grade), count(group.sampled_atoms)];
             row.extend(cells(&ranking.spearman, 1.0, 3));
-            row.extend(cells(&area, 1.0, 3));
+            row.extend(cells(&ranking.area_above(LARGE_FORCE_ERROR), 1.0, 3));
             table.rows.push(row);
         }
     }
@@ -242,15 +211,7 @@ fn elements(comparison: &WalkComparison) -> PageTable {
         INTERVAL,
     ];
     let mut table = PageTable::new("elements", &caption, &titles);
-    let mut groups = named(comparison);
-    groups.retain(|(name, _)| name.starts_with("matched") || *name == "pooled all");
-    if groups.iter().all(|(_, group)| group.elements.len() < 2) {
-        return table;
-    }
-    let rows = groups.iter().flat_map(|(name, group)| group.elements.iter().map(move |of| (*name, of)));
-    let mut rows: Vec<_> = rows.collect();
-    rows.sort_by_key(|(_, of)| of.element);
-    for (name, of) in rows {
+    for (name, of) in wording::elements(comparison) {
         let mut row = vec![text(of.element), text(name), count(of.sampled_atoms)];
         let area = of.gamma_nbr.roc_auc.first().copied().unwrap_or_default();
         for estimate in [of.median_error, of.gamma_nbr.spearman, area] {

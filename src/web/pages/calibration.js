@@ -1,13 +1,13 @@
 // Bounds of the force error by grade, and how often they held.
 
 import { LINES } from "./colours.js";
-import { element, table } from "./dom.js";
+import { element, sentence, table } from "./dom.js";
 import { decimals, percent, range, whole } from "./format.js";
 import { plot } from "./plot.js";
 
 /** The sentence, a plot, and a table of the bins; a second table of labels by value, which are fitted apart. */
 export function errorBounds({ note, found, by_value: byValue }) {
-  const parts = [element("p", {}, `${note[0].toUpperCase()}${note.slice(1)}.`)];
+  const parts = [element("p", {}, sentence(note), ".")];
   if (found.bins.some((bin) => bin.bound != null)) parts.push(element("div", { class: "plots" }, figure(found)));
   if (found.bins.length > 0) parts.push(bins("Bounds of the force error by γ_nbr", found));
   if (byValue) {
@@ -21,7 +21,7 @@ function bins(name, { level, bins: all }) {
   const columns = [["γ_nbr"], ["element"], ["structures", true], [`${percent(level)} below (eV/Å)`, true], ["mean (eV/Å)", true], ["held", true],
     ["tested by", true], ["level in force", true]];
   const shown = all.filter((bin) => several || bin.element == null);
-  const rows = shown.map((bin) => [range(bin), bin.element ?? "all", whole(bin.structures), decimals(bin.bound, 4), decimals(bin.mean, 4),
+  const rows = shown.map((bin) => [range(bin), bin.element ?? "all", whole(bin.structures), decimals(bin.bound, 3), decimals(bin.mean, 3),
     percent(bin.coverage?.share), whole(bin.coverage?.structures ?? 0), percent(bin.level_in_force)]);
   return table(name, columns, rows);
 }

@@ -38,7 +38,7 @@ function pairTable(pairs) {
   const columns = [["median over the pairs"], ["pairs", true], ["biased", true], ["control", true], ["difference of medians", true],
     ["biased larger in", true], ["Wilcoxon p", true], ["sign test p", true]];
   const quantities = [["force MAE (eV/Å)", pairs.force_mae, 3, 1], ["mean |ΔF| (eV/Å)", pairs.mean_force_error, 3, 1],
-    ["energy error (meV/atom)", pairs.energy, 1, 1000], ["stress error (GPa)", pairs.stress, 2, GPA]];
+    ["energy error (meV/atom)", pairs.energy, 1, 1000], ["stress error (GPa)", pairs.stress, 3, GPA]];
   const rows = quantities.filter(([, of]) => of.pairs > 0).map(([name, of, digits, factor]) => [sentence(name), whole(of.pairs),
     estimate(of.biased, digits, factor), estimate(of.control, digits, factor), estimate(of.difference_of_medians, digits, factor),
     `${of.tests.biased_larger} of ${of.tests.biased_larger + of.tests.control_larger}`, probability(of.tests.wilcoxon_p),

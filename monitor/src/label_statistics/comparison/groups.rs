@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use analysis::{Bootstrap, ERROR_THRESHOLDS, SystematicSample};
+use analysis::{Bootstrap, ERROR_THRESHOLDS, SystematicSample, threshold_place};
 use atoms::Species;
 use serde::Serialize;
 
@@ -55,6 +55,13 @@ pub struct GradeRanking {
     /// ROC-AUC for errors above each of the thresholds. Intervals take [`MIN_UNITS`] resampled units with an error above it, and as
     /// many with one that is not.
     pub roc_auc: Vec<ConfidenceEstimate>,
+}
+
+impl GradeRanking {
+    /// The ROC-AUC for errors above one of the thresholds.
+    pub fn area_above(&self, threshold: f64) -> ConfidenceEstimate {
+        threshold_place(threshold).and_then(|place| self.roc_auc.get(place)).copied().unwrap_or_default()
+    }
 }
 
 /// Errors and grades of the atoms of an element.
