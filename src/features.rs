@@ -85,7 +85,6 @@ impl FeatureCalculator {
     }
 
     /// The derivatives of a function of the last structure's features, from its cotangent, the derivatives with respect to them, [n × D].
-    /// Uses up what [`Self::compute`] left: once for each structure.
     pub fn pull_back(&mut self, cotangent: &[f64], out: &mut PullBack) {
         match self.hidden {
             Some(_) => self.grace.pull_back_hidden_layer(cotangent, out),
@@ -102,6 +101,19 @@ impl FeatureCalculator {
                 self.grace.pull_back_hidden_layer(cotangent, out);
             }
         }
+    }
+
+    /// Gradients of combinations of the last structure's features by the coordinates of its atoms, `[weights × 3n]`, 1/Å. Each combination
+    /// has a weight for the first features: those of the first atom, then those of the second, and so on.
+    pub fn combined_gradients(&mut self, weights: &[Vec<f64>]) -> Vec<f64> {
+        let (mut cotangent, mut pull_back) = (vec![0.0; self.features().len()], PullBack::default());
+        let mut rows = Vec::new();
+        for weights in weights {
+            cotangent[..weights.len()].copy_from_slice(weights);
+            self.pull_back(&cotangent, &mut pull_back);
+            rows.extend_from_slice(pull_back.gradient.as_flattened());
+        }
+        rows
     }
 
     /// Gradient of the sum of the last structure's features with respect to the coordinates of its atoms, [3n × D], 1/Å. Takes D
@@ -131,5 +143,44 @@ impl FeatureCalculator {
             }));
         }
         pairs
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use atoms::{Cell, Species};
+
+    /// Of graded features, which are projected and normalised.
+    #[test]
+    fn force_rows_are_derivatives_of_sums_of_features() {
+        let model = concat!(env!("CARGO_MANIFEST_DIR"), "/configs/data/al_eam_1l/kokkos.npz");
+        let mut calculator =
+            FeatureCalculator::new(Arc::new(GraceModel::load(std::path::Path::new(model)).unwrap()));
+        let structure = Structure {
+            species: vec![Species::from_atomic_number(13).unwrap(); 4],
+            positions: vec![[0.0, 0.1, 0.0], [0.2, 2.1, 1.9], [2.0, -0.1, 2.2], [2.1, 2.0, 0.1]],
+            cell: Cell([[0.0; 3]; 3]),
+            periodic: [false; 3],
+        };
+        calculator.compute(&structure).unwrap();
+        let (dimension, rows) = (calculator.dimension(), calculator.force_rows());
+        assert_eq!(rows.len(), 12 * dimension);
+        let mut sums = |shift: f64| {
+            let mut moved = structure.clone();
+            moved.positions[2][1] += shift;
+            calculator.compute(&moved).unwrap();
+            let features = calculator.features();
+            (0..dimension).map(|k| features.iter().skip(k).step_by(dimension).sum()).collect::<Vec<f64>>()
+        };
+        let step = 1e-4;
+        let (ahead, behind) = (sums(step), sums(-step));
+        let row = &rows[7 * dimension..][..dimension];
+        let size = row.iter().fold(0.0_f64, |largest, x| largest.max(x.abs()));
+        assert!(size > 0.0);
+        for (k, found) in row.iter().enumerate() {
+            let expected = (ahead[k] - behind[k]) / (2.0 * step);
+            assert!((found - expected).abs() < 1e-6 * size, "{k}: {found} {expected}");
+        }
     }
 }

@@ -93,6 +93,28 @@ fn the_linear_basis_is_pulled_back() {
     }
 }
 
+/// A pull-back leaves what the forward pass computed as it was.
+#[test]
+fn pull_backs_may_be_repeated() {
+    for name in MODELS {
+        for form in [FeatureForm::Normalised, FeatureForm::Linear] {
+            let model = model(name).with_features(form).unwrap();
+            let (structure, mut grace) = (structure(&model), Grace::new(Arc::new(model)));
+            forward(&mut grace, &structure);
+            let cotangent = numbers(grace.features().len());
+            let pulled_back = |grace: &mut Grace, cotangent: &[f64]| {
+                let (mut energy, mut pull_back) = (Evaluation::default(), PullBack::default());
+                grace.backward(Some(cotangent), &mut energy, &mut pull_back);
+                (energy, pull_back.gradient, pull_back.virial)
+            };
+            let first = pulled_back(&mut grace, &cotangent);
+            let doubled: Vec<_> = cotangent.iter().map(|c| 2.0 * c).collect();
+            pulled_back(&mut grace, &doubled);
+            assert_eq!(pulled_back(&mut grace, &cotangent), first, "{name}");
+        }
+    }
+}
+
 #[test]
 fn the_hidden_layer_is_pulled_back() {
     for name in MODELS {

@@ -4,7 +4,6 @@ use atoms::cell::{norm, sub};
 use atoms::{Cell, Species, Structure, Vec3};
 use potentials::grace::PullBack;
 
-use super::ranks::combined_rows;
 use crate::features::FeatureCalculator;
 
 /// Distances that neighbours keep, Å.
@@ -55,11 +54,11 @@ impl<'a> FeatureMatch<'a> {
         self.target.len()
     }
 
-    /// Gradients of combinations of the features of an atom by the coordinates of its m neighbours, `[weights × 3m]`, 1/Å. `None` without
-    /// features.
-    pub fn combined_rows(&mut self, neighbours: &[Vec3], weights: &[Vec<f64>]) -> Option<Vec<f64>> {
-        let rows = combined_rows(self.calculator, &cluster(self.species, neighbours), weights)?;
-        Some(rows.chunks_exact(3 + 3 * neighbours.len()).flat_map(|row| &row[3..]).copied().collect())
+    /// Gradients of combinations of the features of the last environment by the coordinates of its m neighbours, `[weights × 3m]`, 1/Å.
+    pub fn combined_gradients(&mut self, weights: &[Vec<f64>]) -> Vec<f64> {
+        let columns = 3 * self.calculator.features().len() / self.target.len();
+        let rows = self.calculator.combined_gradients(weights);
+        rows.chunks_exact(columns).flat_map(|row| &row[3..]).copied().collect()
     }
 
     /// The function for the coordinates of the neighbours, `[3m]`, Å; writes its gradient, 1/Å. `None` without features.

@@ -53,7 +53,7 @@ impl NullSpaceWalk {
         matched.deviations(start)?;
         let mut weights = random_weights(self.max_rank + SURPLUS, matched.dimension(), random);
         let columns = 3 * start.len();
-        let values = singular_values(&matched.combined_rows(start, &weights)?, columns)?;
+        let values = singular_values(&matched.combined_gradients(&weights), columns)?;
         let evaluations = 1 + weights.len();
         weights.truncate(rank(&values));
         let mut features = WalkedFeatures { matched, weights, evaluations };
@@ -70,7 +70,7 @@ impl NullSpaceWalk {
         has_moved.then_some((point, features.evaluations))
     }
 
-    /// A step from `point` along `direction`, which is turned as needed. The result is evaluated last.
+    /// A step from `point`, which was evaluated last, along `direction`, which is turned as needed. The result is evaluated last.
     fn step(
         &self,
         features: &mut WalkedFeatures<'_, '_>,
@@ -78,7 +78,7 @@ impl NullSpaceWalk {
         direction: &mut Vec<f64>,
     ) -> Option<Vec<f64>> {
         let columns = point.len();
-        let rows = features.matched.combined_rows(point.as_chunks().0, &features.weights)?;
+        let rows = features.matched.combined_gradients(&features.weights);
         features.evaluations += features.weights.len();
         let changing = RowSpace::new(&rows, columns)?;
         let rigid_too = RowSpace::new(&[rows, rotations(point)].concat(), columns)?;

@@ -3,8 +3,7 @@
 use std::collections::BTreeMap;
 
 use analysis::singular_values;
-use atoms::{Species, Structure};
-use potentials::grace::PullBack;
+use atoms::Species;
 use serde::Serialize;
 
 use super::feature_match::cluster;
@@ -100,14 +99,14 @@ fn examine(
 ) -> Option<FeatureRank> {
     let allowed = allowed(calculator.grace.model(), species, equilibrium)?;
     let neighbours = first_environment(seed, (species, allowed), NEIGHBOURS)?;
-    let environment = cluster(species, &neighbours);
+    calculator.compute(&cluster(species, &neighbours)).ok()?;
     let number = 1 + neighbours.len();
     let atoms = if of_all { number } else { 1 };
     let dimension = atoms * calculator.dimension();
     let sequence = SEQUENCES + u64::from(species.atomic_number());
     let mut random = RandomSequence::new(seed, sequence);
     let weights = random_weights(dimension.min(3 * number) + SURPLUS, dimension, &mut random);
-    let values = singular_values(&combined_rows(calculator, &environment, &weights)?, 3 * number)?;
+    let values = singular_values(&calculator.combined_gradients(&weights), 3 * number)?;
     let largest = values[0];
     let rank = rank(&values);
     Some(FeatureRank {
@@ -131,23 +130,4 @@ pub fn rank(values: &[f64]) -> usize {
 /// Standard normal numbers, `[count][dimension]`.
 pub fn random_weights(count: usize, dimension: usize, random: &mut RandomSequence) -> Vec<Vec<f64>> {
     (0..count).map(|_| (0..dimension).map(|_| random.normal()).collect()).collect()
-}
-
-/// Gradients of combinations of the features of a structure by the coordinates of its n atoms, `[weights × 3n]`, 1/Å. Each combination has a
-/// weight for the first features: those of the first atom, then those of the second, and so on. `None` without features.
-pub fn combined_rows(
-    calculator: &mut FeatureCalculator,
-    structure: &Structure,
-    weights: &[Vec<f64>],
-) -> Option<Vec<f64>> {
-    let (mut cotangent, mut pull_back, mut rows) = (Vec::new(), PullBack::default(), Vec::new());
-    for weights in weights {
-        // A pull-back uses up what the forward pass left.
-        calculator.compute(structure).ok()?;
-        cotangent.resize(calculator.features().len(), 0.0);
-        cotangent[..weights.len()].copy_from_slice(weights);
-        calculator.pull_back(&cotangent, &mut pull_back);
-        rows.extend_from_slice(pull_back.gradient.as_flattened());
-    }
-    Some(rows)
 }

@@ -72,6 +72,10 @@ pub(super) struct ProjectionWork<V> {
     projected: Vec<V>,
     /// ‖B‖ and ‖B_k‖ of each layer, `[n, 1 + layers]`.
     norms: Vec<f64>,
+    /// Cotangents of B̂ R, and the factors of B in those of B, with the same shapes. The reverse pass leaves the forward data as they are:
+    /// it may be repeated.
+    cotangents: Vec<V>,
+    factors: Vec<f64>,
     /// z, `[n, D]`.
     pub features: Vec<f64>,
 }
@@ -80,6 +84,8 @@ pub(super) struct ProjectionWork<V> {
 pub(super) struct Projected<'a, V> {
     projected: ChunkedSlice<'a, V>,
     norms: ChunkedSlice<'a, f64>,
+    cotangents: ChunkedSlice<'a, V>,
+    factors: ChunkedSlice<'a, f64>,
     /// z.
     pub features: ChunkedSlice<'a, f64>,
 }
@@ -90,6 +96,8 @@ impl<V: Vector> ProjectionWork<V> {
         let projection = &map.projection;
         self.projected.resize(n * map.lanes(), V::ZERO);
         self.norms.resize(n * projection.n_norms(), 0.0);
+        self.cotangents.resize(self.projected.len(), V::ZERO);
+        self.factors.resize(self.norms.len(), 0.0);
         self.features.resize(n * projection.feature_dimension(), 0.0);
     }
 
@@ -99,6 +107,8 @@ impl<V: Vector> ProjectionWork<V> {
         Projected {
             projected: ChunkedSlice::new(even(map.lanes()), 0, &mut self.projected[..]),
             norms: ChunkedSlice::new(even(projection.n_norms()), 0, &mut self.norms[..]),
+            cotangents: ChunkedSlice::new(even(map.lanes()), 0, &mut self.cotangents[..]),
+            factors: ChunkedSlice::new(even(projection.n_norms()), 0, &mut self.factors[..]),
             features: ChunkedSlice::new(even(projection.feature_dimension()), 0, &mut self.features[..]),
         }
     }
@@ -107,10 +117,18 @@ impl<V: Vector> ProjectionWork<V> {
 impl<V: Send> SplitByChunk for Projected<'_, V> {
     fn split(self, chunk: &Chunk) -> (Self, Self) {
         let (projected, norms) = (self.projected.split(chunk), self.norms.split(chunk));
+        let (cotangents, factors) = (self.cotangents.split(chunk), self.factors.split(chunk));
         let features = self.features.split(chunk);
+        let of = |projected, norms, cotangents, factors, features| Self {
+            projected,
+            norms,
+            cotangents,
+            factors,
+            features,
+        };
         (
-            Self { projected: projected.0, norms: norms.0, features: features.0 },
-            Self { projected: projected.1, norms: norms.1, features: features.1 },
+            of(projected.0, norms.0, cotangents.0, factors.0, features.0),
+            of(projected.1, norms.1, cotangents.1, factors.1, features.1),
         )
     }
 }
@@ -151,15 +169,15 @@ impl<V: Vector> FeatureMap<V> {
         Self { maps, blocks: basis.blocks.clone(), projection }
     }
 
-    /// Replaces ‖B_k‖ with the factor of layer k's basis in its cotangent.
+    /// The factor of layer k's basis in its cotangent, for each k, from ‖B‖ and ‖B_k‖.
     #[inline(always)]
-    fn norm_cotangents(&self, norms: &mut [f64], along: f64, of_norms: &[f64]) {
+    fn basis_factors(&self, norms: &[f64], along: f64, of_norms: &[f64], factors: &mut [f64]) {
         let scale = f64::from(self.projection.density_scale);
         let density = |k: usize| of_norms.get(k).copied();
         let factor = |norm: f64, cotangent: f64| cotangent / (norm + NORM_FLOOR) / norm;
         let of_all = factor(norms[0], scale * density(0).unwrap_or(0.0) - along);
         for (k, layer) in self.blocks.iter().enumerate() {
-            norms[layer + 1] = of_all + factor(norms[layer + 1], scale * density(k + 1).unwrap_or(0.0));
+            factors[layer + 1] = of_all + factor(norms[layer + 1], scale * density(k + 1).unwrap_or(0.0));
         }
     }
 
@@ -211,20 +229,24 @@ impl<V: Vector> FeatureMap<V> {
     /// additionally L̄_k/(N_k + ε_0) B/N_k.
     #[inline(always)]
     pub fn begin_backward(&self, places: &Range<usize>, cotangent: &[f64], work: &mut Projected<V>) {
-        let map = &self.projection;
-        let rows = work.projected.slice(places).chunks_exact_mut(self.lanes());
-        let rows = rows.zip(work.norms.slice(places).chunks_exact_mut(map.n_norms()));
-        for (cotangent, (projected, norms)) in cotangent.chunks_exact(map.feature_dimension()).zip(rows) {
+        let (map, lanes) = (&self.projection, self.lanes());
+        let forward = work.projected.slice(places).chunks_exact_mut(lanes);
+        let forward = forward.zip(work.norms.slice(places).chunks_exact(map.n_norms()));
+        let reverse = work.cotangents.slice(places).chunks_exact_mut(lanes);
+        let reverse = reverse.zip(work.factors.slice(places).chunks_exact_mut(map.n_norms()));
+        let rows = cotangent.chunks_exact(map.feature_dimension()).zip(forward.zip(reverse));
+        for (cotangent, ((projected, norms), (of_lanes, factors))) in rows {
             let (of_projected, of_norms) = cotangent.split_at(map.dimension);
             let inverse = 1.0 / (norms[0] + NORM_FLOOR);
             let (scale, mut along) = (if map.normalize { inverse } else { 1.0 }, 0.0);
-            for (c, p) in of_projected.iter().zip(V::flat_mut(projected)) {
+            let numbers = V::flat_mut(projected).iter().zip(V::flat_mut(of_lanes));
+            for (c, (p, out)) in of_projected.iter().zip(numbers) {
                 let of_z: f64 = (*p).into();
                 let cotangent = if map.asinh { c / (1.0 + of_z * of_z).sqrt() } else { *c };
                 along += cotangent * of_z;
-                *p = V::Number::round(scale * cotangent);
+                *out = V::Number::round(scale * cotangent);
             }
-            self.norm_cotangents(norms, if map.normalize { along } else { 0.0 }, of_norms);
+            self.basis_factors(norms, if map.normalize { along } else { 0.0 }, of_norms, factors);
         }
     }
 
@@ -241,8 +263,8 @@ impl<V: Vector> FeatureMap<V> {
         let (maps, stride) = (&self.maps[layer], self.projection.n_norms());
         let from = StridedRows::of_atoms(places.len(), self.lanes());
         let to = StridedRows::of_atoms(places.len(), maps.forward.input_lanes());
-        let factors = Factors { numbers: &work.norms.slice(places)[layer + 1..], stride };
-        let lanes = (&*work.projected.slice(places), bases);
+        let factors = Factors { numbers: &work.factors.slice(places)[layer + 1..], stride };
+        let lanes = (&*work.cotangents.slice(places), bases);
         maps.transposed.scale_multiply_add(lanes, from, (to, factors), instructions);
     }
 
