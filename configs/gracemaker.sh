@@ -16,7 +16,7 @@ set -eu
 : "${CUTOFF:=6.5}"            # Å, that of the model
 
 parent=$LINEAGE/$(sha256sum "$CALMWALK_PARENT_MODEL" | cut -c1-64)
-test -e "$parent/model.yaml" || { echo "no checkpoint of $CALMWALK_PARENT_MODEL in $LINEAGE"; exit 1; }
+test -e "$parent/model.yaml" || { echo "no checkpoint of $CALMWALK_PARENT_MODEL in $LINEAGE" >&2; exit 1; }
 
 # Only what ASE's calculator holds: energy, forces and stress.
 python3 - <<'END'
@@ -26,6 +26,8 @@ from ase.io import read, write
 def frames(paths):
     for path in filter(None, paths):
         for atoms in read(path, ":"):
+            if atoms.calc is None:
+                raise SystemExit(f"{path}: a frame without energy and forces where ASE reads them")
             atoms.info = {}
             yield atoms
 

@@ -27,3 +27,11 @@ pub(crate) fn initial(
         .map(|species| factor * table.get(species).copied().unwrap_or(DEFAULT_MOMENT))
         .collect()
 }
+
+/// Number of bands for so many electrons: a fifth more than are occupied, and a few for small cells, since the highest band must be
+/// empty. With the moments of the first attempt (`None`: no spin), so that every attempt has the same number.
+pub(crate) fn bands(structure: &Structure, table: Option<&InitialMagneticMoments>, electrons: f64) -> u64 {
+    let moments = table.map_or(Vec::new(), |table| initial(structure, table, &BTreeSet::new()));
+    let moment: f64 = moments.iter().map(|moment| moment.abs()).sum();
+    (0.6 * (electrons + moment)).ceil() as u64 + 4
+}

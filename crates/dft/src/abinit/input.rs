@@ -60,17 +60,10 @@ fn electrons(
     adjustments: &BTreeSet<RetryAdjustment>,
 ) {
     let structure = &padded.structure;
-    // Bands are counted with the moments of the first attempt, so that every attempt has the same number.
-    let counted = if settings.spin_polarized {
-        moments::initial(structure, &settings.initial_magnetic_moments, &BTreeSet::new())
-    } else {
-        vec![]
-    };
-    let moment: f64 = counted.iter().map(|moment| moment.abs()).sum();
     let electrons: f64 =
         structure.species.iter().filter_map(|s| pseudopotentials.get(s)).map(|p| p.valence).sum();
-    // A fifth more bands than are occupied, and a few for small cells: the highest band must be empty.
-    let bands = (0.6 * (electrons + moment)).ceil() as u64 + 4;
+    let table = settings.spin_polarized.then_some(&settings.initial_magnetic_moments);
+    let bands = moments::bands(structure, table, electrons);
     *text += &format!("nband {bands}\n");
     if pseudopotentials.values().any(|p| p.paw) {
         *text += &format!("pawecutdg {:?} eV\n", settings.fine_cutoff.unwrap_or(2.0 * settings.cutoff));

@@ -108,18 +108,12 @@ fn system(
     text + "/\n"
 }
 
-/// Number of bands: a fifth more than are occupied, and a few for small cells, since the highest band must be empty.
+/// Number of bands.
 fn bands(settings: &EspressoSettings, padded: &PaddedStructure, files: &BTreeMap<Species, &UpfFile>) -> u64 {
     let structure = &padded.structure;
-    // Bands are counted with the moments of the first attempt, so that every attempt has the same number.
-    let counted = if settings.spin_polarized {
-        moments::initial(structure, &settings.initial_magnetic_moments, &BTreeSet::new())
-    } else {
-        vec![]
-    };
-    let moment: f64 = counted.iter().map(|moment| moment.abs()).sum();
     let electrons: f64 = structure.species.iter().filter_map(|s| files.get(s)).map(|file| file.valence).sum();
-    (0.6 * (electrons + moment)).ceil() as u64 + 4
+    let table = settings.spin_polarized.then_some(&settings.initial_magnetic_moments);
+    moments::bands(structure, table, electrons)
 }
 
 fn electrons(settings: &EspressoSettings, adjustments: &BTreeSet<RetryAdjustment>) -> String {

@@ -19,7 +19,7 @@ const TOP: f64 = 24.0;
 /// `None` for one model and one set, whose panel is in another figure, or without an error above zero.
 pub fn draw(sets: &[LabelledSet]) -> Option<FigureEntry> {
     let panels: Vec<_> = sets.chunks(COLUMNS).flat_map(panels).collect();
-    if panels.iter().flatten().count() < 2 {
+    if panels.iter().flatten().flatten().count() < 2 {
         return None;
     }
     let description =
@@ -30,7 +30,8 @@ pub fn draw(sets: &[LabelledSet]) -> Option<FigureEntry> {
     let mut letters = 'a'..='z';
     for (line, panels) in panels.iter().enumerate() {
         let places = row(COLUMNS, [46.0, 64.0, 16.0], TOP + ROW * line as f64, PANEL);
-        for ((title, split), place) in panels.iter().zip(places) {
+        for (panel, place) in panels.iter().zip(places) {
+            let Some((title, split)) = panel else { continue };
             draw_split(&mut figure, split, place, letters.next().unwrap_or(' '));
             figure.text([place.x + 6.0, place.y - 6.0], title, Anchor::Start);
             push_split(&mut numbers, split, title);
@@ -44,11 +45,14 @@ pub fn draw(sets: &[LabelledSet]) -> Option<FigureEntry> {
     Some(FigureEntry { name: "error-grid".into(), title: "Force errors by model and set", drawn })
 }
 
-/// Rows of panels with their titles: the model of the scores, then the others.
-fn panels(sets: &[LabelledSet]) -> Vec<Vec<(String, Split<'_>)>> {
+/// A panel with its title; `None` for a set without errors on either side of the limit.
+type GridPanel<'a> = Option<(String, Split<'a>)>;
+
+/// Rows of panels: the model of the scores, then the others. Rows without any panel are left out.
+fn panels(sets: &[LabelledSet]) -> Vec<Vec<GridPanel<'_>>> {
     let models = sets.first().map_or(0, |set| set.models.len());
     let panel = |line: usize| {
-        sets.iter().filter_map(move |set| {
+        sets.iter().map(move |set| {
             let (model, score) = match line.checked_sub(1) {
                 None => ("model", set.report.scores.get(AVERAGE)?),
                 Some(k) => (set.models[k].model.as_str(), &set.models[k].average),
@@ -56,5 +60,7 @@ fn panels(sets: &[LabelledSet]) -> Vec<Vec<(String, Split<'_>)>> {
             Some((format!("{model}: {}", set.file), split(score)?))
         })
     };
-    (0..=models).map(|line| panel(line).collect()).collect()
+    let mut rows: Vec<Vec<_>> = (0..=models).map(|line| panel(line).collect()).collect();
+    rows.retain(|panels| panels.iter().any(Option::is_some));
+    rows
 }
