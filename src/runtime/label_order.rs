@@ -1,8 +1,10 @@
 //! Keeps the order of the label queue while a campaign runs: computes the value of each queued structure, and learns which labels
 //! complete, for the order and for the selector.
 
+use std::panic::resume_unwind;
 use std::time::Duration;
 
+use monitor::completion_model::{self, CompletionModel};
 use monitor::label_value::{FeatureScales, LabelOrderReader, OrderInputs, ValuedLabel, order};
 use serde_json::json;
 use store::{JobState, LabelValue, Store, StoreError};
@@ -37,6 +39,8 @@ struct OrderKeeper {
     protocol: ContentHash,
     /// Name of the protocol.
     name: String,
+    /// Of the potential of the walks.
+    version: u32,
     by_value: bool,
     reader: LabelOrderReader,
     completion: watch::Sender<Option<CompletionCoefficients>>,
@@ -70,6 +74,7 @@ impl LabelOrderTask {
             store: run.store.clone(),
             protocol: campaign.protocol.hash,
             name: campaign.protocol.name.clone(),
+            version: campaign.version_number(),
             by_value,
             reader: LabelOrderReader::new(campaign.version_number(), scales),
             completion,
@@ -108,18 +113,34 @@ impl OrderKeeper {
     }
 
     async fn compute(&mut self) -> Result<(), StoreError> {
-        let OrderInputs { rows, covering, completion } = self.reader.read(&self.store, self.protocol).await?;
-        if let Some(model) = completion {
-            self.completion.send_replace(Some(model.coefficients));
+        if !self.by_value {
+            let examples = completion_model::examples(&self.store, self.protocol, self.version).await?;
+            self.send(CompletionModel::fit(&examples));
+            return Ok(());
         }
-        if !self.by_value || rows.is_empty() {
+        let OrderInputs { rows, covering, completion } = self.reader.read(&self.store, self.protocol).await?;
+        self.send(completion);
+        if rows.is_empty() {
             return Ok(());
         }
         // A long queue takes a second.
-        let ordered = spawn_blocking(move || order(&rows, &covering)).await.unwrap_or_default();
+        let ordered = match spawn_blocking(move || order(&rows, &covering)).await {
+            Ok(ordered) => ordered,
+            Err(error) => match error.try_into_panic() {
+                Ok(panic) => resume_unwind(panic),
+                // The program ends.
+                Err(_) => return Ok(()),
+            },
+        };
         let values: Vec<_> = ordered.iter().map(stored).collect();
         self.store.set_label_values(&values).await?;
         Ok(())
+    }
+
+    fn send(&self, model: Option<CompletionModel>) {
+        if let Some(model) = model {
+            self.completion.send_replace(Some(model.coefficients));
+        }
     }
 }
 
@@ -131,7 +152,8 @@ impl QueueProgress {
     /// Whether enough has changed since the order was computed for `before`.
     fn is_due_after(self, before: Self) -> bool {
         let enough = (before.queued / CHANGED_PART).clamp(1, MAX_CHANGES);
-        self.finished >= before.finished + enough || self.all >= before.all + enough
+        // Fewer are finished when labels are made again.
+        self.finished.abs_diff(before.finished) >= enough || self.all.abs_diff(before.all) >= enough
     }
 }
 
@@ -152,6 +174,7 @@ mod tests {
             (progress(100, 0), progress(109, 0), false),
             (progress(100, 0), progress(110, 0), true),
             (progress(9000, 7), progress(8950, 57), true),
+            (progress(10, 30), progress(20, 20), true),
         ] {
             assert_eq!(after.is_due_after(before), due, "{before:?} {after:?}");
         }

@@ -133,4 +133,7 @@ async fn values_are_computed_from_finished_and_queued_structures() {
     assert_eq!(store.features_of(77).await.unwrap(), None);
     store.exclude(&[names[2].clone()], "bad", 5).await.unwrap();
     assert_eq!(store.finished_structures(dft, 0, 9).await.unwrap().len(), 1);
+    // A guard rejected it before any calculation: nothing says whether that would have completed.
+    store.fail(&held, "rejected_by_label_guard", "", 1, 6).await.unwrap();
+    assert_eq!(store.finished_structures(dft, 0, 9).await.unwrap().len(), 1);
 }

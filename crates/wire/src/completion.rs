@@ -1,4 +1,4 @@
-//! The probability that the calculation of a label completes: what it depends on, and a model's coefficients as a message.
+//! The probability that the calculation of a label completes: what it depends on, and the coefficients of a model.
 //!
 //! The process that reads finished labels learns the coefficients; the selector may decline candidates by them.
 

@@ -47,6 +47,12 @@ pub async fn read(
     Ok(state)
 }
 
+/// Whether labels by value stand in for the others: with too few others for any bound, and more by value. The first labels of a campaign
+/// come before any value is known.
+fn is_by_value_in_use(found: u64, by_value: u64) -> bool {
+    found < CALIBRATION.least() as u64 && found < by_value
+}
+
 impl CalibrationState {
     fn new(version: u32) -> Self {
         let empty = ConformalMap::new(Bins::for_grades(), CALIBRATION);
@@ -67,7 +73,7 @@ impl CalibrationState {
     /// Expected |ΔF|, eV/Å, of an atom with this γ_nbr under the original mixture of the version. `None` without enough labels in
     /// its bin.
     pub fn expected_error(&self, gamma_nbr: f64) -> Option<f64> {
-        self.in_use().expected(gamma_nbr)
+        self.found.expected(gamma_nbr).or_else(|| self.by_value.expected(gamma_nbr))
     }
 
     /// How often bounds held for the newest structures.
@@ -80,11 +86,11 @@ impl CalibrationState {
         self.in_use().outcomes()
     }
 
-    /// The map for structures as the campaign finds them; with labels by value only, the map of these.
+    /// The map for structures as the campaign finds them; with too few labels of these, the map of labels by value.
     fn in_use(&self) -> &ConformalMap<&'static str> {
-        match self.found.structures() {
-            0 => &self.by_value,
-            _ => &self.found,
+        match is_by_value_in_use(self.found.structures(), self.by_value.structures()) {
+            true => &self.by_value,
+            false => &self.found,
         }
     }
 }

@@ -3,7 +3,7 @@
 use analysis::{ConformalMap, ConformalWindow, RollingCoverage};
 use serde::{Deserialize, Serialize};
 
-use super::CalibrationState;
+use super::{CalibrationState, is_by_value_in_use};
 
 /// The bounds of a version.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
@@ -72,10 +72,10 @@ impl CalibrationState {
 }
 
 impl CalibrationSummary {
-    /// The map for structures as the campaign finds them; with labels by value only, the map of these.
+    /// The map for structures as the campaign finds them; with too few labels of these, the map of labels by value.
     pub fn in_use(&self) -> &CalibrationMap {
         match &self.by_value {
-            Some(by_value) if self.found.structures == 0 => by_value,
+            Some(by_value) if is_by_value_in_use(self.found.structures, by_value.structures) => by_value,
             _ => &self.found,
         }
     }

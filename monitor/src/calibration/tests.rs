@@ -20,10 +20,13 @@ fn labelled(number: u32, ordered_by_value: bool, elements: &[(&'static str, f64)
 fn labels_by_value_are_fitted_apart() {
     let mut state = CalibrationState::new(2);
     (0..30).for_each(|k| state.learn(&labelled(k, true, &[("Si", 9.0)])));
-    // Without other labels these are all that is known.
+    // Without other labels, or with too few of them, these are all that is known.
     assert_eq!((state.bound(0.1, "Si"), state.structures()), (Some(90.0), 30));
+    (0..5).for_each(|k| state.learn(&labelled(k, false, &[("Si", 1.0)])));
+    assert_eq!((state.bound(0.1, "Si"), state.structures()), (Some(90.0), 35));
+    assert!(state.expected_error(0.1).is_some() && state.coverage().is_some());
     assert_eq!(state.summary().in_use().structures, 30);
-    (0..30).for_each(|k| state.learn(&labelled(k, false, &[("Si", 1.0)])));
+    (5..30).for_each(|k| state.learn(&labelled(k, false, &[("Si", 1.0)])));
     assert_eq!((state.bound(0.1, "Si"), state.structures()), (Some(10.0), 60));
     assert_eq!(state.expected_error(0.1), Some(5.5));
     let summary = state.summary();

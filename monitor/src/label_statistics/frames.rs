@@ -84,6 +84,8 @@ pub(super) struct FailedFrame {
     pub walk: u32,
     pub step: u64,
     pub content: ContentHash,
+    /// As [`ComparedFrame::is_shared`].
+    pub is_shared: bool,
 }
 
 impl ComparedFrames {
@@ -140,11 +142,11 @@ impl ComparedFrames {
         self.labelled.add(u64::from(walk), frame);
     }
 
-    /// Adds a candidate whose label failed.
-    pub fn add_failed(&mut self, candidate: &FinishedCandidate) {
+    /// Adds a candidate whose label failed. `is_shared`: walks of both origins found it.
+    pub fn add_failed(&mut self, candidate: &FinishedCandidate, is_shared: bool) {
         let FinishedCandidate { origin, walk, step, content, .. } = candidate;
         let walk = self.biased_walk(*walk);
-        let failed = FailedFrame { origin: *origin, walk, step: *step, content: *content };
+        let failed = FailedFrame { origin: *origin, walk, step: *step, content: *content, is_shared };
         self.failed.add(u64::from(walk), failed);
     }
 

@@ -108,7 +108,7 @@ pub async fn read(
         let Some(last) = page.last() else { break };
         after = last.decision;
         let own = page.iter().filter(|candidate| versions.of(candidate.walk) == version);
-        own.for_each(|candidate| statistics.finished(candidate));
+        own.for_each(|candidate| statistics.finished(candidate, &shared));
     }
     Ok(statistics)
 }
@@ -169,7 +169,7 @@ impl LabelStatistics {
         self.by_version.entry(version).or_insert_with(|| ErrorsByGrade::new(MAX_SAMPLES_OF_VERSION))
     }
 
-    fn finished(&mut self, candidate: &FinishedCandidate) {
+    fn finished(&mut self, candidate: &FinishedCandidate, shared: &HashSet<ContentHash>) {
         for (completion, value) in
             [(&mut self.by_gamma, candidate.gamma), (&mut self.by_expansion, candidate.relative_volume)]
         {
@@ -179,7 +179,7 @@ impl LabelStatistics {
             }
         }
         if let Some(grades) = &candidate.unlabelled {
-            self.compared.add_failed(candidate);
+            self.compared.add_failed(candidate, shared.contains(&candidate.content));
             self.for_origin(candidate.origin, |all| all.unlabelled(grades));
         }
     }

@@ -108,6 +108,7 @@ pub fn order(rows: &[QueuedLabel], covering: &[CoveringLabel]) -> Vec<ValuedLabe
         let number = rows.len() as u64;
         groups.push(rows.into_iter().map(|row| WaitingLabel::new(row, &known, number, covering)).collect());
     }
+    set_unknown_diversities(&mut groups);
     let mut ordered = Vec::with_capacity(rows.len());
     for group in 0..groups.len() {
         while let Some(place) = next(&groups[group]) {
@@ -119,6 +120,16 @@ pub fn order(rows: &[QueuedLabel], covering: &[CoveringLabel]) -> Vec<ValuedLabe
         }
     }
     ordered
+}
+
+/// Structures whose features are unknown, or those of another version of the potential than the scales, get the mean diversity of the
+/// others: 1 would put them before all.
+fn set_unknown_diversities(groups: &mut [Vec<WaitingLabel<'_>>]) {
+    let is_known = |waiting: &&WaitingLabel<'_>| waiting.row.features.is_some();
+    let known = groups.iter().flatten().filter(is_known).map(|waiting| waiting.factors.diversity);
+    let diversity = mean(known);
+    let unknown = groups.iter_mut().flatten().filter(|waiting| waiting.row.features.is_none());
+    unknown.for_each(|waiting| waiting.factors.diversity = diversity);
 }
 
 /// The place of the largest value; of equal ones, of the one that was found first.

@@ -44,7 +44,7 @@ impl CompletionRule {
         let probability = match self.source.as_ref()? {
             ProbabilitySource::Log(probability) => *probability,
             ProbabilitySource::Model(coefficients) if coefficients.is_constant() => return None,
-            ProbabilitySource::Model(coefficients) => coefficients.probability(&predictors(graded)),
+            ProbabilitySource::Model(coefficients) => coefficients.probability(&predictors(graded)?),
         };
         let probability = (probability * PARTS).round() / PARTS;
         Some(CompletionCheck { probability, min_probability: self.min_probability })
@@ -70,10 +70,9 @@ impl CompletionCheck {
     }
 }
 
-/// The grade is that of the original mixture, which does not move while labels are made.
-fn predictors(graded: &RegradedCandidate) -> CompletionPredictors {
+/// As the model's examples have them. The grade is that of the original mixture, which does not move while labels are made.
+fn predictors(graded: &RegradedCandidate) -> Option<CompletionPredictors> {
     let view = graded.block.view();
     let gamma = maximum(&graded.original.gamma);
-    let species = view.structure().species;
-    CompletionPredictors::new(&species, &graded.bonds.shortest, gamma, Some(view.relative_volume()))
+    CompletionPredictors::of_structure(&view.structure(), gamma, Some(view.relative_volume())).ok()
 }

@@ -15,7 +15,8 @@ use crate::error::{Result, StoreError};
 use crate::label_values::{FinishedStructure, LabelValue, QueuedStructure};
 use crate::numbers::decode_numbers;
 
-/// The newest, each with the walk that found it first. Without excluded labels, and without imported structures.
+/// The newest, each with the walk that found it first. Without excluded labels, structures that `label.guard` rejected (their
+/// calculations never began), and imported structures.
 pub(crate) const FINISHED: &str = concat!(
     "SELECT job.state AS job_state, ",
     joined!(candidate),
@@ -25,6 +26,8 @@ pub(crate) const FINISHED: &str = concat!(
           WHERE job.state IN ('labelled', 'failed') AND job.protocol = $1 AND candidate.walk >= $2 AND candidate.walk < $3
           AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure AND label.protocol = job.protocol
                           AND status = 'excluded')
+          AND NOT (job.state = 'failed' AND EXISTS (SELECT 1 FROM attempt WHERE attempt.job = job.number
+                   AND attempt.attempt = job.attempts AND class = 'rejected_by_label_guard'))
           ORDER BY job.decision DESC LIMIT $4) AS page
     CROSS JOIN job ON job.number = place
     CROSS JOIN candidate ON candidate.decision = job.decision
@@ -56,7 +59,7 @@ const FEATURES_OF: &str = "SELECT candidate.decision AS decision, features, feat
     WHERE candidate.decision = $1";
 
 const SET: &str = "UPDATE job SET value = new.value, value_factors = new.factors FROM {rows}
-    WHERE job.number = new.number AND job.state = 'queued'";
+    WHERE job.number = new.number AND job.state = 'queued' AND (job.value IS NULL OR job.value <> new.value)";
 
 const COLUMNS: [&str; 3] = ["number", "value", "factors"];
 
@@ -148,7 +151,7 @@ impl Store {
     }
 
     /// Sets the values of those of these jobs that are queued, in one transaction. NaN and negative values count as 0. Returns
-    /// the number of jobs that got one.
+    /// the number of jobs whose value changed: only these are locked.
     pub async fn set_label_values(&self, values: &[LabelValue]) -> Result<u64> {
         let row = |found: &LabelValue| -> Vec<SqlValue> {
             let value = found.value.clamp(0.0, f64::MAX);

@@ -13,7 +13,7 @@ use analysis::{Bootstrap, ERROR_THRESHOLDS};
 use serde::Serialize;
 use wire::{ContentHash, Origin};
 
-use super::frames::{ComparedAtom, ComparedFrame, ComparedFrames};
+use super::frames::{ComparedAtom, ComparedFrame, ComparedFrames, FailedFrame};
 
 pub use groups::{ComparedGroup, ElementRanking, GradeRanking};
 pub use pairs::{PairCounts, PairPoint, PairedErrors, PairedQuantity, PairedTests};
@@ -120,8 +120,10 @@ impl WalkComparison {
     }
 }
 
-/// Number of structures of these origins whose labels failed.
+/// Number of structures of these origins whose labels failed. Those that walks of both origins found count for both together only.
 fn failed(frames: &ComparedFrames, origins: &[Origin]) -> u64 {
-    let of = frames.failed.items().filter(|failed| origins.contains(&failed.origin));
+    let is_of =
+        |failed: &&FailedFrame| origins.contains(&failed.origin) && (origins.len() > 1 || !failed.is_shared);
+    let of = frames.failed.items().filter(is_of);
     of.map(|failed| failed.content).collect::<HashSet<ContentHash>>().len() as u64
 }

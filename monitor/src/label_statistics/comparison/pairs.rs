@@ -127,7 +127,8 @@ impl LabelOutcome<'_> {
     }
 }
 
-/// Matches by biased walk and step. Where a biased walk found several structures at one step, in several segments, the first counts.
+/// Matches by biased walk and step. Where a biased walk found several structures at one step, in several segments, the first
+/// labelled one counts, or the first failed one.
 pub(super) fn match_frames(frames: &ComparedFrames) -> MatchedFrames<'_> {
     let mut places: BTreeMap<(u32, u64), [Option<LabelOutcome>; 2]> = BTreeMap::new();
     let side = |origin: Origin| usize::from(origin == Origin::Control);

@@ -70,6 +70,7 @@ fn fail(frames: &mut ComparedFrames, origin: Origin, f: u64) {
         walk: (f / 2) as u32,
         step: 10 * (1 + f % 2),
         content: content(1000 + 100 * side(origin) + f),
+        is_shared: false,
     };
     frames.failed.add(f / 2, failed);
 }
