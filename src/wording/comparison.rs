@@ -59,7 +59,7 @@ fn left_out(counts: &PairCounts) -> Option<String> {
         ..
     } = *counts;
     let parts = [
-        (same_structure, "that are one structure"),
+        (same_structure, "of one structure"),
         (biased_failed, "whose biased label failed"),
         (control_failed, "whose control label failed"),
         (both_failed, "whose labels both failed"),
@@ -216,7 +216,7 @@ mod tests {
         assert_eq!(left_out(&PairCounts { pairs: 9, ..PairCounts::default() }), None);
         let counts =
             PairCounts { same_structure: 2, control_failed: 1, biased_alone: 1, ..PairCounts::default() };
-        let expected = "not among the pairs: 2 pairs that are one structure, 1 pair whose control label failed, 1 biased structure and \
+        let expected = "not among the pairs: 2 pairs of one structure, 1 pair whose control label failed, 1 biased structure and \
                         0 control frames without a labelled or failed partner";
         assert_eq!(left_out(&counts).as_deref(), Some(expected));
     }

@@ -44,7 +44,7 @@ pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
          structures of each bin, with the 90 % quantile of all labelled atoms in equally wide bins with at least {MIN_ATOMS} atoms: {}. b, \
          Share of the atoms of a structure whose error was not above the bound from before its label came, mean over the newest {} \
          structures at that time (n = {}). Dashed grey, γ_{{nbr}} = 1 and the promised share.{}",
-        wording::calibration::sentence(&summary),
+        wording::calibration::sentence(&summary).replace("γ_nbr", "γ_{nbr}"),
         CALIBRATION.counted,
         grouped(labels.calibration.outcomes().len() as u64),
         data.collections.of_version()
