@@ -16,7 +16,6 @@ mod walk_time;
 
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use atoms::Repetition;
 use calm::Artifact;
@@ -24,7 +23,7 @@ use calm::forgetting::ForgettingAlarm;
 use monitor::reference_check::{self, KnownStructure};
 use orchestrator::grader::Grader;
 use orchestrator::selector::{CampaignMode, PotentialVersion, SelectorSettings, TrainingFrames};
-use potentials::grace::{GraceModel, Precision};
+use potentials::grace::Precision;
 use serde_json::{Value, json};
 use store::Protocol;
 use wire::{CampaignId, ContentHash};
@@ -34,6 +33,7 @@ use crate::config::{Config, ConfigError, LabelMethod, Loaded, Warning, without_c
 use crate::exit_status::CommandError;
 use crate::label_method::MethodConfig;
 use crate::label_method::resolved_method;
+use crate::loaded_model::LoadedModel;
 use crate::output::log_and_warn;
 use crate::versions::VersionOnDisk;
 pub use draft::CampaignDraft;
@@ -66,7 +66,7 @@ pub struct LoadedCampaign {
     /// Its text.
     pub text: String,
     /// The model.
-    pub model: Arc<GraceModel>,
+    pub model: LoadedModel,
     /// The initial mixture.
     pub artifact: Artifact,
     /// Seed structures, in the order of the files.
@@ -102,7 +102,7 @@ impl LoadedCampaign {
             let training = loader.training_frames(&model, &artifact.mixture)?;
             Ok((artifact, training))
         });
-        let labels = loader.seed_structures(&model).and_then(|mut seeds| {
+        let labels = loader.seed_structures(&*model.shared()).and_then(|mut seeds| {
             let protocol = loader.protocol(&mut seeds)?;
             warnings.extend(loader.plan_walks(&mut seeds)?);
             loader.check_update_target(&seeds.valid)?;
@@ -114,9 +114,9 @@ impl LoadedCampaign {
         warnings.extend(loader.suspicious_seed_structures(&seeds));
         let pair_ranges = pair_ranges(&config, &seeds.valid);
         warnings.extend(loader.repulsion_in_bonds(&pair_ranges));
-        let (known, suspicious) = loader.known_structures(&model)?;
+        let (known, suspicious) = loader.known_structures(&model.shared())?;
         warnings.extend(suspicious);
-        file_hashes.insert(0, loader.hash("potential.model", &config.potential.model)?);
+        file_hashes.insert(0, loader.model_hash(&model)?);
         let others = [
             ("calm.artifact", &config.calm.artifact),
             ("calm.training_frames", &config.calm.training_frames),
@@ -124,7 +124,7 @@ impl LoadedCampaign {
         for (key, file) in others {
             file_hashes.extend(file.as_ref().map(|file| loader.hash(key, file)).transpose()?);
         }
-        file_hashes.extend(loader.refit_files(&model)?);
+        file_hashes.extend(loader.refit_files(&*model.shared())?);
         let path = path.to_owned();
         Ok(Self {
             config,
@@ -209,6 +209,11 @@ impl LoadedCampaign {
         value["files"] = Value::Object(hashes.collect());
         value["label"]["protocol"] = json!(self.config.label.protocol_name());
         value["label"]["method"] = resolved_method(&self.config.label, &self.protocol);
+        // Its place and its processor cores change no result.
+        match self.config.potential.python {
+            Some(_) => value["potential"]["python"] = json!({ "identity": self.hash_of("potential.model") }),
+            None => drop(value["potential"].as_object_mut().map(|potential| potential.remove("python"))),
+        }
         // Campaigns that began before this key existed have none.
         if self.config.potential.precision == Precision::Double {
             value["potential"].as_object_mut().map(|potential| potential.remove("precision"));
@@ -334,7 +339,7 @@ fn combine_errors<A, B>(
 pub fn load_for_grades(
     config: &Config,
     name: &Path,
-) -> Result<(Arc<GraceModel>, Artifact, Option<TrainingFrames>), ConfigError> {
+) -> Result<(LoadedModel, Artifact, Option<TrainingFrames>), ConfigError> {
     let loader = Loader { path: name, text: "", config };
     let model = loader.model()?;
     let artifact = loader.artifact(&model)?;
@@ -343,7 +348,8 @@ pub fn load_for_grades(
 }
 
 /// The part of the model that grades need.
-pub fn grader(model: &GraceModel) -> Grader {
+pub fn grader(model: &LoadedModel) -> Grader {
+    let model = model.shared();
     let n = model.elements().len();
     let cutoffs = (0..n * n).map(|k| model.pair_cutoff(k / n, k % n)).collect();
     Grader::new(model.elements().to_vec(), cutoffs)

@@ -1,6 +1,7 @@
 //! The features of a model: those that its file describes, those of an artifact, or others of the same model.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use calm::Projection;
 use calm::baselines::FeatureOrigin;
@@ -8,7 +9,7 @@ use potentials::grace::{self, FeatureForm, GraceModel, UnfitProjection};
 
 use crate::exit_status::CommandError;
 use crate::features::FeatureCalculator;
-use crate::file_hash;
+use crate::loaded_model::LoadedModel;
 
 /// Which features to use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -36,7 +37,7 @@ impl FeatureVariant {
 /// A model with one variant of its features.
 #[derive(Clone)]
 pub struct FeatureModel {
-    pub model: std::sync::Arc<GraceModel>,
+    pub model: LoadedModel,
     is_hidden: bool,
 }
 
@@ -46,7 +47,7 @@ impl FeatureModel {
     /// # Errors
     /// An unreadable model; one without a projection of its features, unless they are those of the hidden layer.
     pub fn load(path: &Path, variant: Option<FeatureVariant>) -> Result<Self, CommandError> {
-        Self::new(path, GraceModel::load(path).map_err(CommandError::input)?, variant)
+        Self::new(path, LoadedModel::load(path)?, variant)
     }
 
     /// The same of a model that was loaded from `path`.
@@ -55,28 +56,28 @@ impl FeatureModel {
     /// As [`Self::load`].
     pub fn new(
         path: &Path,
-        model: GraceModel,
+        model: LoadedModel,
         variant: Option<FeatureVariant>,
     ) -> Result<Self, CommandError> {
-        Self::from_model(model, variant).ok_or_else(|| {
-            CommandError::Input(format!(
-                "{}: the model has no projection of its features (uq_rp_matrix): give its artifact with --artifact, or build one \
-                 with calmwalk calm build",
-                path.display()
-            ))
-        })
-    }
-
-    fn from_model(model: GraceModel, variant: Option<FeatureVariant>) -> Option<Self> {
-        let form = match variant {
-            Some(FeatureVariant::Normalised) => FeatureForm::Normalised,
-            Some(FeatureVariant::Linear) => FeatureForm::Linear,
-            Some(FeatureVariant::Hidden) => return Some(Self { model: model.into(), is_hidden: true }),
-            None => {
-                return model.projection().is_some().then(|| Self { model: model.into(), is_hidden: false });
+        let Some(variant) = variant else {
+            if model.dimension() > 0 {
+                return Ok(Self { model, is_hidden: false });
             }
+            return Err(without_projection(path));
         };
-        Some(Self { model: model.with_features(form)?.into(), is_hidden: false })
+        let LoadedModel::Grace(grace) = model else {
+            return Err(CommandError::Input(format!(
+                "{}: --feature-variant is for GRACE models, whose readout and basis calmwalk knows; this one runs in Python",
+                path.display()
+            )));
+        };
+        let form = match variant {
+            FeatureVariant::Normalised => FeatureForm::Normalised,
+            FeatureVariant::Linear => FeatureForm::Linear,
+            FeatureVariant::Hidden => return Ok(Self { model: grace.into(), is_hidden: true }),
+        };
+        let model = grace.with_features(form).ok_or_else(|| without_projection(path))?;
+        Ok(Self { model: model.into(), is_hidden: false })
     }
 
     /// The variant of the model of `path` whose features an artifact has: the file's own, another with the same matrix, or the hidden
@@ -84,21 +85,25 @@ impl FeatureModel {
     ///
     /// # Errors
     /// A model of another basis.
-    pub fn for_artifact(path: &Path, model: GraceModel, artifact: &Projection) -> Result<Self, CommandError> {
-        if *artifact == unchanged(model.hidden_dimension()) {
-            return Ok(Self { model: model.into(), is_hidden: true });
+    pub fn for_artifact(
+        path: &Path,
+        model: LoadedModel,
+        artifact: &Projection,
+    ) -> Result<Self, CommandError> {
+        let hidden = model.grace().map(|grace| unchanged(grace.hidden_dimension()));
+        if hidden.as_ref() == Some(artifact) {
+            return Ok(Self { model, is_hidden: true });
         }
-        if model.projection().is_none() {
-            let model = with_projection(model, artifact)
+        if model.dimension() == 0 {
+            let model = model
+                .with_projection(artifact)
                 .map_err(|error| CommandError::Input(format!("{}: {error}", path.display())))?;
             return Self::new(path, model, None);
         }
         let own = Self::new(path, model, None)?;
         let fits = |found: &Self| found.projection().is_some_and(|found| artifact.check_same(&found).is_ok());
-        if fits(&own) {
-            return Ok(own);
-        }
-        let others = [FeatureForm::Normalised, FeatureForm::Linear].map(|form| own.model.with_features(form));
+        let Some(grace) = own.model.grace().filter(|_| !fits(&own)) else { return Ok(own) };
+        let others = [FeatureForm::Normalised, FeatureForm::Linear].map(|form| grace.with_features(form));
         let mut others =
             others.into_iter().flatten().map(|model| Self { model: model.into(), is_hidden: false });
         Ok(others.find(fits).unwrap_or(own))
@@ -118,13 +123,18 @@ impl FeatureModel {
 
     /// Computes these features on the calling thread.
     pub fn calculator(&self) -> FeatureCalculator {
-        let model = self.model.clone();
-        if self.is_hidden { FeatureCalculator::of_hidden_layer(model) } else { FeatureCalculator::new(model) }
+        match self.model.grace().filter(|_| self.is_hidden) {
+            Some(grace) => FeatureCalculator::of_hidden_layer(Arc::clone(grace)),
+            None => FeatureCalculator::new(self.model.shared()),
+        }
     }
 
     /// D
     pub fn dimension(&self) -> usize {
-        if self.is_hidden { self.model.hidden_dimension() } else { self.model.feature_dimension() }
+        match self.model.grace().filter(|_| self.is_hidden) {
+            Some(grace) => grace.hidden_dimension(),
+            None => self.model.dimension(),
+        }
     }
 
     /// Whether the features are the hidden layer.
@@ -133,19 +143,22 @@ impl FeatureModel {
     }
 
     /// The projection in an artifact of these features: theirs, or for the hidden layer, which is no projection of the basis, one that
-    /// changes nothing.
+    /// changes nothing. So have features that a program in Python gives.
     pub fn stored_projection(&self) -> Option<Projection> {
-        if self.is_hidden { Some(unchanged(self.dimension())) } else { self.projection() }
+        if self.is_hidden || self.model.has_final_features() {
+            return Some(unchanged(self.dimension()));
+        }
+        self.projection()
     }
 
-    /// How the features follow from the basis; `None` for the hidden layer.
+    /// How the features follow from the basis; `None` for the hidden layer, and for features that a program in Python gives.
     pub fn projection(&self) -> Option<Projection> {
-        model_projection(&self.model).filter(|_| !self.is_hidden)
+        self.model.projection().filter(|_| !self.is_hidden)
     }
 
     /// Chemical symbols, in the order of the element indices.
     pub fn symbols(&self) -> Vec<String> {
-        self.model.elements().iter().map(|element| element.symbol().to_owned()).collect()
+        self.model.symbols()
     }
 
     /// What ties baselines to these features.
@@ -154,11 +167,12 @@ impl FeatureModel {
     /// A file that cannot be read.
     pub fn origin(&self, path: &Path) -> Result<FeatureOrigin, CommandError> {
         let variant = match self.projection() {
-            None => FeatureVariant::Hidden.name().to_owned(),
+            None if self.is_hidden => FeatureVariant::Hidden.name().to_owned(),
+            None => "final".to_owned(),
             Some(found) => variant(&found),
         };
         Ok(FeatureOrigin {
-            model: file_hash::model_hash(path)?,
+            model: self.model.content_hash(path)?,
             variant,
             symbols: self.symbols(),
             dimension: self.dimension(),
@@ -198,8 +212,16 @@ pub fn with_projection(model: GraceModel, projection: &Projection) -> Result<Gra
     })
 }
 
-/// The projection of the hidden layer: the identity.
-fn unchanged(dimension: usize) -> Projection {
+fn without_projection(path: &Path) -> CommandError {
+    CommandError::Input(format!(
+        "{}: the model has no projection of its features (uq_rp_matrix): give its artifact with --artifact, or build one with \
+         calmwalk calm build",
+        path.display()
+    ))
+}
+
+/// The projection of features that are not projected: the identity.
+pub fn unchanged(dimension: usize) -> Projection {
     let mut matrix = vec![0.0; dimension * dimension];
     matrix.iter_mut().step_by(dimension + 1).for_each(|x| *x = 1.0);
     Projection {

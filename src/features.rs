@@ -4,17 +4,16 @@ use std::sync::Arc;
 
 use atoms::{Evaluation, NeighbourList, PotentialError, Structure, StructureError, shortest_distance};
 use calm::{NeighbourWeights, Pair};
-use potentials::grace::{Grace, GraceModel, PullBack};
+use potentials::grace::{GraceModel, HiddenLayerModel, PullBack, Threads};
+use potentials::{ModelWithFeatures, PotentialWithFeatures};
 
 /// Shortest accepted distance, Å; the shortest bond, that of H₂, is 0.74 Å. Label programs apply the same limit.
 const MIN_DISTANCE: f64 = 0.4;
 
 /// A model with work arrays.
 pub struct FeatureCalculator {
-    pub grace: Grace,
+    pub potential: Box<dyn PotentialWithFeatures>,
     pub neighbours: NeighbourList,
-    /// The hidden layer of the readout, if it is the feature.
-    hidden: Option<Vec<f64>>,
     /// Derivatives of the energy, which come with those of the features.
     of_energy: Evaluation,
 }
@@ -40,101 +39,92 @@ pub enum FeatureError {
 
 impl FeatureCalculator {
     /// Computes on the calling thread.
-    pub fn new(model: Arc<GraceModel>) -> Self {
+    pub fn new(model: Arc<dyn ModelWithFeatures>) -> Self {
         Self {
             neighbours: NeighbourList::new(model.cutoff(), 0.0),
-            grace: Grace::new(model),
-            hidden: None,
+            potential: model.evaluator(Threads::default()),
             of_energy: Evaluation::default(),
         }
     }
 
     /// The same with the hidden layer of the readout as features.
     pub fn of_hidden_layer(model: Arc<GraceModel>) -> Self {
-        Self { hidden: Some(Vec::new()), ..Self::new(model) }
+        Self::new(Arc::new(HiddenLayerModel(model)))
     }
 
     /// D
     pub fn dimension(&self) -> usize {
-        let model = self.grace.model();
-        if self.hidden.is_some() { model.hidden_dimension() } else { model.feature_dimension() }
+        self.potential.model().feature_dimension()
     }
 
     /// Features of the last structure, [n × D].
     pub fn features(&self) -> &[f64] {
-        self.hidden.as_deref().unwrap_or_else(|| self.grace.features())
+        self.potential.features()
     }
 
-    /// Computes energies and features of `structure`, which [`Grace`] then has. Returns the element index of each atom.
+    /// Computes energies and features of `structure`. Returns the element index of each atom.
     pub fn compute(&mut self, structure: &Structure) -> Result<Vec<usize>, FeatureError> {
-        let elements = self.grace.model().element_indices(&structure.species)?;
+        let elements = self.potential.model().element_indices(&structure.species)?;
         self.neighbours.update(structure)?;
         let shortest = shortest_distance(structure, &self.neighbours);
         if let Some((i, j, distance)) = shortest.filter(|(_, _, distance)| *distance < MIN_DISTANCE) {
             return Err(FeatureError::Coincident(i, j, distance));
         }
-        self.grace.forward(structure, &self.neighbours)?;
-        let energy: f64 = self.grace.atomic_energies().iter().sum();
+        self.potential.forward(structure, &self.neighbours)?;
+        let energy: f64 = self.potential.atomic_energies().iter().sum();
         if !energy.is_finite() {
             return Err(FeatureError::NotFinite(energy));
-        }
-        if let Some(hidden) = &mut self.hidden {
-            self.grace.hidden_layer(hidden);
         }
         Ok(elements)
     }
 
     /// The derivatives of a function of the last structure's features, from its cotangent, the derivatives with respect to them, [n × D].
-    pub fn pull_back(&mut self, cotangent: &[f64], out: &mut PullBack) {
-        match self.hidden {
-            Some(_) => self.grace.pull_back_hidden_layer(cotangent, out),
-            None => self.grace.backward(Some(cotangent), &mut self.of_energy, out),
-        }
+    pub fn pull_back(&mut self, cotangent: &[f64], out: &mut PullBack) -> Result<(), PotentialError> {
+        self.potential.backward(Some(cotangent), &mut self.of_energy, out)
     }
 
     /// The derivatives of the last structure's energy and, with a cotangent, those of its features as in [`Self::pull_back`].
-    pub fn backward(&mut self, cotangent: Option<&[f64]>, energy: &mut Evaluation, out: &mut PullBack) {
-        match cotangent.filter(|_| self.hidden.is_some()) {
-            None => self.grace.backward(cotangent, energy, out),
-            Some(cotangent) => {
-                self.grace.backward(None, energy, out);
-                self.grace.pull_back_hidden_layer(cotangent, out);
-            }
-        }
+    pub fn backward(
+        &mut self,
+        cotangent: Option<&[f64]>,
+        energy: &mut Evaluation,
+        out: &mut PullBack,
+    ) -> Result<(), PotentialError> {
+        self.potential.backward(cotangent, energy, out)
     }
 
     /// Gradients of combinations of the last structure's features by the coordinates of its atoms, `[weights × 3n]`, 1/Å. Each combination
     /// has a weight for the first features: those of the first atom, then those of the second, and so on.
-    pub fn combined_gradients(&mut self, weights: &[Vec<f64>]) -> Vec<f64> {
+    pub fn combined_gradients(&mut self, weights: &[Vec<f64>]) -> Result<Vec<f64>, PotentialError> {
         let (mut cotangent, mut pull_back) = (vec![0.0; self.features().len()], PullBack::default());
         let mut rows = Vec::new();
         for weights in weights {
             cotangent[..weights.len()].copy_from_slice(weights);
-            self.pull_back(&cotangent, &mut pull_back);
+            self.pull_back(&cotangent, &mut pull_back)?;
             rows.extend_from_slice(pull_back.gradient.as_flattened());
         }
-        rows
+        Ok(rows)
     }
 
     /// Gradient of the sum of the last structure's features with respect to the coordinates of its atoms, [3n × D], 1/Å. Takes D
     /// reverse sweeps.
-    pub fn force_rows(&mut self) -> Vec<f64> {
+    pub fn force_rows(&mut self) -> Result<Vec<f64>, PotentialError> {
         let (dimension, numbers) = (self.dimension(), self.features().len());
         let (mut rows, mut pull_back) = (vec![0.0; 3 * numbers], PullBack::default());
         for feature in 0..dimension {
             let mut cotangent = vec![0.0; numbers];
             cotangent.iter_mut().skip(feature).step_by(dimension).for_each(|c| *c = 1.0);
-            self.pull_back(&cotangent, &mut pull_back);
+            self.pull_back(&cotangent, &mut pull_back)?;
             let column = rows.iter_mut().skip(feature).step_by(dimension);
             column.zip(pull_back.gradient.as_flattened()).for_each(|(row, gradient)| *row = *gradient);
         }
-        rows
+        Ok(rows)
     }
 
     /// Directed bonds of the last structure within the pair cutoffs, to average over neighbourhoods. `elements` are those that
     /// [`Self::compute`] returned.
     pub fn pairs(&self, structure: &Structure, elements: &[usize], weights: NeighbourWeights) -> Vec<Pair> {
-        let (model, mut bonds, mut pairs) = (self.grace.model(), Vec::new(), Vec::new());
+        let (model, mut bonds, mut pairs) = (self.potential.model(), Vec::new(), Vec::new());
         for (i, centre) in elements.iter().enumerate() {
             self.neighbours.bonds_within(structure, i, model.cutoff(), &mut bonds);
             pairs.extend(bonds.iter().map(|bond| {
@@ -164,7 +154,7 @@ mod tests {
             periodic: [false; 3],
         };
         calculator.compute(&structure).unwrap();
-        let (dimension, rows) = (calculator.dimension(), calculator.force_rows());
+        let (dimension, rows) = (calculator.dimension(), calculator.force_rows().unwrap());
         assert_eq!(rows.len(), 12 * dimension);
         let mut sums = |shift: f64| {
             let mut moved = structure.clone();

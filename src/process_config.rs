@@ -6,12 +6,15 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use bridge::{ModelDescription, PythonModel};
 use calm::Projection;
+use potentials::ModelWithFeatures;
 use potentials::grace::{GraceModel, Precision, RadialPath};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use store::Protocol;
-use wire::ipc::ConnectInfo;
+use tokio_util::sync::CancellationToken;
+use wire::ipc::{CallAddress, ConnectInfo};
 use workers::labeller::LabelBounds;
 use workers::settings::WalkSettings;
 
@@ -34,6 +37,28 @@ pub struct ModelFiles {
     pub precision: Precision,
 }
 
+/// The model of a walker.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields, rename_all = "snake_case")]
+pub enum WalkerModel {
+    /// An export of GRACE.
+    Grace(ModelFiles),
+    /// A model of the device of this host.
+    Python(Box<DeviceModel>),
+}
+
+/// How a walker reaches a model of the device of its host.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct DeviceModel {
+    /// The model.
+    pub description: ModelDescription,
+    /// The artifact with the projection of its invariants, if they are projected.
+    pub artifact: Option<HashedFile>,
+    /// Where calls go.
+    pub address: CallAddress,
+}
+
 /// A file whose content must not change.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
@@ -53,7 +78,7 @@ pub struct WalkerConfig {
     /// How to connect to the orchestrator.
     pub connect_info: ConnectInfo,
     /// The model.
-    pub model: ModelFiles,
+    pub model: WalkerModel,
     /// Threads that evaluate it.
     pub threads: usize,
     /// Dynamics, bias and guards.
@@ -165,5 +190,21 @@ impl ModelFiles {
     /// All files.
     pub fn files(&self) -> impl Iterator<Item = &HashedFile> {
         std::iter::once(&self.export).chain(&self.artifact)
+    }
+}
+
+impl WalkerModel {
+    /// Loads the model of this process. Cancelling `stopping` ends calls of a device that does not answer.
+    pub fn load(&self, stopping: &CancellationToken) -> Result<Arc<dyn ModelWithFeatures>, CommandError> {
+        let DeviceModel { description, artifact, address } = match self {
+            Self::Grace(files) => return Ok(files.load()?),
+            Self::Python(model) => &**model,
+        };
+        let model = PythonModel::shared(description.clone(), address.clone(), stopping.clone());
+        let model = model.map_err(CommandError::Input)?;
+        let Some(artifact) = artifact else { return Ok(Arc::new(model)) };
+        verify_hash(&artifact.path, &artifact.hash)?;
+        let projection = Projection::load(&artifact.path).map_err(CommandError::input)?;
+        Ok(Arc::new(model.projected(projection).map_err(CommandError::Input)?))
     }
 }

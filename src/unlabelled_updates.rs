@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use calm::{Grades, Mixture};
 use orchestrator::selector::{SelectorSettings, UpdateProtocol, update_settings_in_force};
-use potentials::grace::GraceModel;
+use potentials::ModelWithFeatures;
 use store::{CampaignRecord, Fate, Store, StoredCandidate};
 use tokio_util::sync::CancellationToken;
 
@@ -70,7 +70,7 @@ pub fn updating_settings(campaign: &CampaignRecord) -> Result<SelectorSettings, 
 /// A campaign that never updates its mixture, a damaged database.
 pub async fn apply(
     store: &Store,
-    model: &Arc<GraceModel>,
+    model: &Arc<dyn ModelWithFeatures>,
     mixture: Mixture,
     stop: &CancellationToken,
 ) -> Result<Option<MixtureAfterUpdates>, CommandError> {
@@ -90,7 +90,7 @@ pub async fn apply(
 /// As [`apply`], for all accepted candidates but those of the decisions in `known`.
 pub async fn apply_others(
     store: &Store,
-    model: &Arc<GraceModel>,
+    model: &Arc<dyn ModelWithFeatures>,
     mixture: Mixture,
     known: &HashSet<i64>,
     stop: &CancellationToken,
@@ -113,7 +113,7 @@ pub async fn apply_others(
 impl<'a> CandidateUpdater<'a> {
     async fn new(
         store: &Store,
-        model: &Arc<GraceModel>,
+        model: &Arc<dyn ModelWithFeatures>,
         mixture: Mixture,
         stop: &'a CancellationToken,
     ) -> Result<Self, CommandError> {

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use atoms::Structure;
-use calm::baselines::{Baseline, BaselineError, BaselineKind};
+use calm::baselines::{Baseline, BaselineKind};
 
 use super::own_features::OwnFeatures;
 use super::{AtomScore, DetectionRule};
@@ -48,30 +48,29 @@ impl AtomScore for BaselineScore {
         elements: &[usize],
         features: &[f64],
     ) -> Result<Vec<f64>, String> {
-        let found = match &mut self.own {
-            None => self.baseline.score(elements, features),
+        match &mut self.own {
+            None => self.baseline.score(elements, features).map_err(|error| error.to_string()),
             Some(own) => score_own_features(&self.baseline, own.compute(structure)?, elements),
-        };
-        found.map_err(|error| error.to_string())
+        }
     }
 }
 
 /// Scores the features that `calculator` computed last, or their forces if that is what the baseline scores.
 ///
 /// # Errors
-/// Features that the baseline cannot score.
+/// Features that the baseline cannot score, or a model that does not answer.
 pub fn score_own_features(
     baseline: &Baseline,
     calculator: &mut FeatureCalculator,
     elements: &[usize],
-) -> Result<Vec<f64>, BaselineError> {
+) -> Result<Vec<f64>, String> {
     if baseline.kind().has_force_form() {
-        let rows = calculator.force_rows();
-        if let Some(found) = baseline.score_forces(&rows)? {
+        let rows = calculator.force_rows().map_err(|error| error.to_string())?;
+        if let Some(found) = baseline.score_forces(&rows).map_err(|error| error.to_string())? {
             return Ok(found);
         }
     }
-    baseline.score(elements, calculator.features())
+    baseline.score(elements, calculator.features()).map_err(|error| error.to_string())
 }
 
 /// D-optimality detects above 1, as in the paper. Other scores have no limit. Those that have a zero are

@@ -237,7 +237,7 @@ fn relaxed(
 ) -> (Structure, Option<Relaxation>) {
     let Some(fire) = fire else { return (ideal.clone(), None) };
     let stop = || progress.is_stopped();
-    match fire.relax(ideal.clone(), &mut grader.features.grace, &stop) {
+    match fire.relax(ideal.clone(), &mut *grader.features.potential, &stop) {
         Ok(found) => {
             let pairs = found.structure.positions.iter().zip(&ideal.positions);
             let largest_displacement = pairs.map(|(a, b)| norm(sub(*a, *b))).fold(0.0, f64::max);

@@ -3,20 +3,20 @@
 use std::sync::Arc;
 
 use atoms::Structure;
-use potentials::grace::GraceModel;
+use potentials::ModelWithFeatures;
 
 use super::{AtomScore, DetectionRule};
 use crate::features::FeatureCalculator;
 
 /// Scores all atoms of a structure by the standard deviation of the energy per atom over the models, eV.
 pub struct EnergySpread {
-    models: Vec<Arc<GraceModel>>,
+    models: Vec<Arc<dyn ModelWithFeatures>>,
     calculators: Vec<FeatureCalculator>,
 }
 
 impl EnergySpread {
     /// The spread over these models, two or more.
-    pub fn new(models: Vec<Arc<GraceModel>>) -> Self {
+    pub fn new(models: Vec<Arc<dyn ModelWithFeatures>>) -> Self {
         let calculators = models.iter().cloned().map(FeatureCalculator::new).collect();
         Self { models, calculators }
     }
@@ -39,7 +39,7 @@ impl AtomScore for EnergySpread {
         let mut energies = Vec::new();
         for calculator in &mut self.calculators {
             calculator.compute(structure).map_err(|error| error.to_string())?;
-            let energy: f64 = calculator.grace.atomic_energies().iter().sum();
+            let energy: f64 = calculator.potential.atomic_energies().iter().sum();
             energies.push(energy / structure.len() as f64);
         }
         Ok(vec![standard_deviation(&energies); elements.len()])

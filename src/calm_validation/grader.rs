@@ -53,7 +53,7 @@ pub struct Graded {
 impl ValidationGrader {
     pub fn new(subject: &Subject) -> Self {
         Self {
-            features: FeatureCalculator::new(subject.model.clone()),
+            features: FeatureCalculator::new(subject.model.shared()),
             mixture: subject.mixture.clone(),
             others: subject.others.iter().map(|score| score.for_thread()).collect(),
             grades: Grades::default(),
@@ -63,7 +63,7 @@ impl ValidationGrader {
     /// The energy of `structure`, eV. `None` if it cannot be computed.
     pub fn energy(&mut self, structure: &Structure) -> Option<f64> {
         self.features.compute(structure).ok()?;
-        Some(self.features.grace.atomic_energies().iter().sum())
+        Some(self.features.potential.atomic_energies().iter().sum())
     }
 
     /// Energy and scores of `structure`.
@@ -72,7 +72,7 @@ impl ValidationGrader {
     /// Why it cannot be graded: atoms so close that energy or features are not finite.
     pub fn grade(&mut self, structure: &Structure) -> Result<Graded, String> {
         let elements = self.features.compute(structure).map_err(|error| error.to_string())?;
-        let features = self.features.grace.features();
+        let features = self.features.potential.features();
         self.grades.evaluate(&self.mixture, &elements, features, None).map_err(|error| error.to_string())?;
         let mut scores = vec![self.grades.gamma.clone()];
         for other in &mut self.others {
@@ -81,7 +81,7 @@ impl ValidationGrader {
         let pairs = self.features.pairs(structure, &elements, NeighbourWeights::default());
         let average = |score: &Vec<f64>| neighbourhood_average(score, pairs.iter().copied());
         let averages = scores.iter().map(average).collect::<Result<_, _>>();
-        let energy = self.features.grace.atomic_energies().iter().sum();
+        let energy = self.features.potential.atomic_energies().iter().sum();
         Ok(Graded { energy, averages: averages.map_err(|error| error.to_string())?, scores })
     }
 }

@@ -30,11 +30,11 @@ use std::sync::Arc;
 use atoms::Species;
 use calm::Mixture;
 use md::Fire;
-use potentials::grace::GraceModel;
 use serde::Serialize;
 
 use self::labelled::LabelledSet;
 use crate::exit_status::CommandError;
+use crate::loaded_model::LoadedModel;
 
 pub use self::baseline_score::{BaselineScore, score_own_features};
 pub use self::bond_scans::BondScan;
@@ -120,7 +120,7 @@ pub struct ScoreDescription {
 /// The model, the mixture and further scores.
 #[derive(Clone)]
 pub struct Subject {
-    pub model: Arc<GraceModel>,
+    pub model: LoadedModel,
     pub mixture: Arc<Mixture>,
     /// Scores to compare γ with.
     pub others: Arc<[Box<dyn AtomScore>]>,

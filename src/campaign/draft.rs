@@ -1,19 +1,17 @@
 //! A configuration that is not written yet, with the files that it names. `calmwalk init` chooses values by it.
 
 use std::path::Path;
-use std::sync::Arc;
-
-use potentials::grace::GraceModel;
 
 use super::loader::Loader;
 use super::seed_structures::SourcedStructure;
 use super::short_range::{PairRange, pair_ranges};
 use crate::config::{Config, ConfigError, LabelMethod, Loaded, Warning};
+use crate::loaded_model::LoadedModel;
 
 /// What the configuration names.
 pub struct CampaignDraft {
     /// The model.
-    pub model: Arc<GraceModel>,
+    pub model: LoadedModel,
     /// Seed structures that walks can start from.
     pub seed_structures: Vec<SourcedStructure>,
     /// The pairs of elements in the seed structures.
@@ -33,7 +31,7 @@ impl CampaignDraft {
         let loader = Loader { path, text: &text, config: &config };
         let model = loader.model()?;
         let artifact = loader.artifact(&model)?;
-        let mut seeds = loader.seed_structures(&model)?;
+        let mut seeds = loader.seed_structures(&*model.shared())?;
         if let LabelMethod::Potential(_) = &config.label.method {
             loader.protocol(&mut seeds)?;
         }

@@ -5,9 +5,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use atoms::cell::norm;
-use atoms::{Evaluation, NeighbourList, Potential, Species, Vec3};
+use atoms::{Evaluation, NeighbourList, Species, Vec3};
 use monitor::reference_check::KnownStructure;
-use potentials::grace::{Grace, GraceModel};
+use potentials::ModelWithFeatures;
+use potentials::grace::Threads;
 use toml::Spanned;
 use wire::ContentHash;
 
@@ -27,7 +28,7 @@ impl Loader<'_> {
     /// The structures of the check with what is known of them, none without a check, and warnings.
     pub fn known_structures(
         &self,
-        model: &Arc<GraceModel>,
+        model: &Arc<dyn ModelWithFeatures>,
     ) -> Result<(Vec<KnownStructure>, Vec<Warning>), ConfigError> {
         let Some(file) = &self.config.label.reference_check.structures else {
             return Ok((Vec::new(), Vec::new()));
@@ -68,7 +69,7 @@ impl Loader<'_> {
         &self,
         file: &Spanned<PathBuf>,
         known: &[KnownStructure],
-        model: &Arc<GraceModel>,
+        model: &Arc<dyn ModelWithFeatures>,
     ) -> Vec<Warning> {
         let (needed, bounds) = (elements(known).len() + 1, self.config.label.reference_check.bounds());
         let few = (known.len() < needed).then(|| {
@@ -104,14 +105,14 @@ fn elements(known: &[KnownStructure]) -> BTreeSet<Species> {
 
 /// The factor between the potential's forces and the known ones, by least squares. `None` if the potential can evaluate
 /// none of the structures, or has no forces there.
-fn force_ratio(known: &[KnownStructure], model: &Arc<GraceModel>) -> Option<f64> {
-    let mut grace = Grace::new(Arc::clone(model));
+fn force_ratio(known: &[KnownStructure], model: &Arc<dyn ModelWithFeatures>) -> Option<f64> {
+    let mut potential = Arc::clone(model).evaluator(Threads::default());
     let (mut product, mut square) = (0.0, 0.0);
     for KnownStructure { structure, label, .. } in known {
         let (mut neighbours, mut evaluation) =
             (NeighbourList::new(model.cutoff(), 0.0), Evaluation::default());
         if neighbours.update(structure).is_err()
-            || grace.evaluate(structure, &neighbours, &mut evaluation).is_err()
+            || potential.evaluate(structure, &neighbours, &mut evaluation).is_err()
         {
             continue;
         }

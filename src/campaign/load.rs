@@ -4,11 +4,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use atoms::{NeighbourList, Structure};
+use bridge::PythonModel;
 use calm::forgetting::GradeDistribution;
 use calm::{Artifact, ArtifactError, Grades, Mixture, Projection};
 use dft::SetupError;
-use orchestrator::selector::{TrainingFrames, UpdateProtocol};
-use potentials::grace::{Grace, GraceModel, RadialPath};
+use orchestrator::selector::{CampaignMode, TrainingFrames, UpdateProtocol};
+use potentials::grace::{GraceModel, RadialPath, Threads};
+use potentials::{ModelWithFeatures, PotentialWithFeatures};
 use serde_json::Value;
 use store::Protocol;
 use toml::Spanned;
@@ -19,9 +21,10 @@ use super::training_sample::{self, SampledFrame};
 use crate::all_cores;
 use crate::artifact_checks::{check_belongs_to, check_sound};
 use crate::config::{ConfigError, LabelMethod, OnInvalid, PotentialConfig, Warning, location};
-use crate::feature_variant::with_projection;
 use crate::file_hash;
 use crate::label_method::{self, REFERENCE_FILE};
+use crate::loaded_model::LoadedModel;
+use crate::python_model;
 
 /// Largest number of seed-structure atoms that are graded.
 const MAX_GRADED_ATOMS: usize = 256;
@@ -40,15 +43,28 @@ const NO_STATISTICS: &str = "no scatter matrices and counts, so its mixture can 
                           take the mixture of the export as it is";
 
 impl Loader<'_> {
-    /// Loads the model, which must support the configured settings. Without a projection of its features, it gets that of the
-    /// artifact.
-    pub fn model(&self) -> Result<Arc<GraceModel>, ConfigError> {
-        let file = &self.config.potential.model;
+    /// Loads the model, or starts its program. It must support the configured settings. Without a projection of its features, it gets
+    /// that of the artifact.
+    pub fn model(&self) -> Result<LoadedModel, ConfigError> {
+        let potential = &self.config.potential;
+        let file = &potential.model;
         let wrong = |message: String| self.file_error("potential.model", file, message);
-        let precision = self.config.potential.precision;
-        let model = GraceModel::load_in(file.get_ref(), precision, RadialPath::default())
-            .map_err(|error| wrong(error.to_string()))?;
-        let model = if model.projection().is_some() { model } else { self.projected(model)? };
+        let model: LoadedModel = match &potential.python {
+            None => GraceModel::load_in(file.get_ref(), potential.precision, RadialPath::default())
+                .map_err(|error| wrong(error.to_string()))?
+                .into(),
+            Some(python) => {
+                let settings = python.settings(file.get_ref(), potential.precision);
+                let key = "potential.python".to_owned();
+                let at = location(self.path, self.text, &key);
+                let failed = |message| ConfigError::File { at, key, message };
+                let device = python_model::start(settings).map_err(|error| error.to_string());
+                let model = device.and_then(PythonModel::local).map_err(failed)?;
+                self.check_python(&model)?;
+                LoadedModel::Python(Arc::new(model))
+            }
+        };
+        let model = if model.dimension() > 0 { model } else { self.projected(model)? };
         let widest = self.config.guard.zbl.as_ref().and_then(|windows| windows.widest(model.elements()));
         if let Some((pair, window)) = widest
             && window.outer > model.cutoff()
@@ -58,11 +74,39 @@ impl Loader<'_> {
             let expected = format!("at most the cutoff of the model, {} Å", model.cutoff());
             return Err(ConfigError::Value { at, key, found, expected });
         }
-        Ok(Arc::new(model))
+        Ok(model)
+    }
+
+    /// Reproducible campaigns need results that depend on the structure only.
+    fn check_python(&self, model: &PythonModel) -> Result<(), ConfigError> {
+        let Some(test) = model.device().map(|device| &device.info().self_test) else { return Ok(()) };
+        let alone = self.config.potential.python.as_ref().is_some_and(|python| python.max_batch.get() == 1);
+        let expected = if !test.is_deterministic {
+            "\"live\": the model gives other bits when a call is repeated"
+        } else if !test.is_batch_independent && !alone {
+            "\"live\", or potential.python.max_batch = 1: the bits of a structure depend on those beside it in a batch"
+        } else {
+            return Ok(());
+        };
+        if self.config.campaign.mode == CampaignMode::Live {
+            return Ok(());
+        }
+        let key = "campaign.mode".to_owned();
+        let (found, expected) = ("\"reproducible\"".to_owned(), expected.to_owned());
+        Err(ConfigError::Value { at: location(self.path, self.text, &key), key, found, expected })
+    }
+
+    /// Key and hash of the model.
+    pub fn model_hash(&self, model: &LoadedModel) -> Result<(String, String), ConfigError> {
+        let key = "potential.model";
+        match model {
+            LoadedModel::Grace(_) => self.hash(key, &self.config.potential.model),
+            LoadedModel::Python(model) => Ok((key.to_owned(), model.description().identity.clone())),
+        }
     }
 
     /// The model with the projection of the artifact.
-    fn projected(&self, model: GraceModel) -> Result<GraceModel, ConfigError> {
+    fn projected(&self, model: LoadedModel) -> Result<LoadedModel, ConfigError> {
         let Some(file) = &self.config.calm.artifact else {
             let file = &self.config.potential.model;
             let message = format!(
@@ -76,7 +120,7 @@ impl Loader<'_> {
         let wrong = |message: String| self.file_error("calm.artifact", file, message);
         let projection =
             Projection::load(path).map_err(|error| wrong(explain_artifact_error(path, &error)))?;
-        with_projection(model, &projection).map_err(|error| wrong(format!("{}: {error}", path.display())))
+        model.with_projection(&projection).map_err(|error| wrong(format!("{}: {error}", path.display())))
     }
 
     /// Checks that an update ends what made a seed structure's atoms a candidate. Otherwise its walks would offer the
@@ -103,7 +147,7 @@ impl Loader<'_> {
     }
 
     /// Loads the initial mixture: that of the artifact, or else that of the export.
-    pub fn artifact(&self, model: &GraceModel) -> Result<Artifact, ConfigError> {
+    pub fn artifact(&self, model: &LoadedModel) -> Result<Artifact, ConfigError> {
         let model_file = &self.config.potential.model;
         let Some(file) = &self.config.calm.artifact else {
             let export = Artifact::load_export(model_file.get_ref())
@@ -125,14 +169,15 @@ impl Loader<'_> {
     /// Computes features of a sample of the training frames. The median of γ must be between 0.001 and 1.
     pub fn training_frames(
         &self,
-        model: &Arc<GraceModel>,
+        model: &LoadedModel,
         original: &Mixture,
     ) -> Result<Option<TrainingFrames>, ConfigError> {
         let Some(file) = &self.config.calm.training_frames else { return Ok(None) };
         let wrong = |message: String| self.file_error(TRAINING_FRAMES, file, message);
         let path = file.get_ref();
         let sample = training_sample::read(path).map_err(wrong)?;
-        let features = all_cores::map(sample.iter(), || Features::new(model), Features::of_sample);
+        let model = model.shared();
+        let features = all_cores::map(sample.iter(), || Features::new(&model), Features::of_sample);
         let (mut elements, mut values) = (Vec::new(), Vec::new());
         for (frame, features) in sample.iter().zip(features) {
             let in_frame = |error: String| wrong(format!("{}:{}: {error}", path.display(), frame.line));
@@ -156,7 +201,7 @@ impl Loader<'_> {
     /// Warns of suspicious initial grades.
     pub fn suspicious_grades(
         &self,
-        model: &Arc<GraceModel>,
+        model: &LoadedModel,
         artifact: &Artifact,
         seeds: &[SourcedStructure],
         training: Option<&TrainingFrames>,
@@ -175,11 +220,11 @@ impl Loader<'_> {
         let file = self.config.calm.artifact.as_ref().unwrap_or(&self.config.potential.model);
         let key = if self.config.calm.artifact.is_some() { "calm.artifact" } else { "potential.model" };
         let wrong = |message: String| self.file_error(key, file, message);
-        let (mut features, mut grades) = (Features::new(model), Grades::default());
+        let (mut features, mut grades) = (Features::new(&model.shared()), Grades::default());
         let (mut gamma, mut first_error) = (Vec::new(), None);
         for SourcedStructure { plan, source, .. } in seeds {
             let graded = features.compute(&plan.structure).and_then(|elements| {
-                let values = features.grace.features();
+                let values = features.potential.features();
                 let graded = grades.evaluate(&artifact.mixture, &elements, values, None);
                 graded.map_err(|error| error.to_string())
             });
@@ -300,28 +345,29 @@ fn with_seed_structure(message: &str, SourcedStructure { plan, source, .. }: &So
 
 /// Computes features of structures one after another.
 struct Features {
-    grace: Grace,
+    potential: Box<dyn PotentialWithFeatures>,
     neighbours: NeighbourList,
 }
 
 impl Features {
-    fn new(model: &Arc<GraceModel>) -> Self {
-        Self { grace: Grace::new(Arc::clone(model)), neighbours: NeighbourList::new(model.cutoff(), 0.0) }
+    fn new(model: &Arc<dyn ModelWithFeatures>) -> Self {
+        let neighbours = NeighbourList::new(model.cutoff(), 0.0);
+        Self { potential: Arc::clone(model).evaluator(Threads::default()), neighbours }
     }
 
     /// Computes the features of all atoms. Returns their element indices.
     fn compute(&mut self, structure: &Structure) -> Result<Vec<usize>, String> {
-        let elements = self.grace.model().element_indices(&structure.species);
+        let elements = self.potential.model().element_indices(&structure.species);
         let elements = elements.map_err(|error| error.to_string())?;
         self.neighbours.update(structure).map_err(|error| error.to_string())?;
-        self.grace.forward(structure, &self.neighbours).map_err(|error| error.to_string())?;
+        self.potential.forward(structure, &self.neighbours).map_err(|error| error.to_string())?;
         Ok(elements)
     }
 
     /// Element indices and features, [n × D], of the atoms of a frame that belong to the sample.
     fn of_sample(&mut self, frame: &SampledFrame) -> Result<(Vec<usize>, Vec<f64>), String> {
         let elements = self.compute(&frame.structure)?;
-        let features = self.grace.features();
+        let features = self.potential.features();
         let dimension = features.len() / elements.len().max(1);
         let rows = frame.atoms.iter().flat_map(|atom| &features[atom * dimension..][..dimension]);
         Ok((frame.atoms.iter().map(|atom| elements[*atom]).collect(), rows.copied().collect()))

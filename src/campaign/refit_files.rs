@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use potentials::grace::GraceModel;
+use potentials::ModelWithFeatures;
 use tokio_util::sync::CancellationToken;
 use toml::Spanned;
 
@@ -16,7 +16,7 @@ impl Loader<'_> {
     ///
     /// # Errors
     /// A file that cannot be read, has no labels, or has an element that the model lacks.
-    pub fn refit_files(&self, model: &GraceModel) -> Result<Vec<(String, String)>, ConfigError> {
+    pub fn refit_files(&self, model: &dyn ModelWithFeatures) -> Result<Vec<(String, String)>, ConfigError> {
         let Some(refit) = &self.config.refit else { return Ok(Vec::new()) };
         let replay = refit.replay.iter().enumerate();
         let hashes = replay.map(|(number, file)| {
@@ -41,7 +41,7 @@ impl Loader<'_> {
         &self,
         key: &str,
         file: &Spanned<PathBuf>,
-        model: &GraceModel,
+        model: &dyn ModelWithFeatures,
     ) -> Result<(), ConfigError> {
         let wrong = |message: String| self.file_error(key, file, message);
         let files = StructureReadingArgs::default().files(std::slice::from_ref(file.get_ref()));

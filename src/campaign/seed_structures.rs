@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use atoms::{CloseContact, Repetition, Structure, extxyz, read_structures};
 use calm::rules::Positive;
 use orchestrator::selector::SeedStructurePlan;
-use potentials::grace::GraceModel;
+use potentials::ModelWithFeatures;
 use toml::Spanned;
 use wire::ContentHash;
 
@@ -97,7 +97,7 @@ struct SourcedFrame<'a> {
 impl Loader<'_> {
     /// Reads every frame of every file. Names must be unique. Frames that no walk can start from are left out, with a
     /// reason each, if the configuration allows it and others remain.
-    pub fn seed_structures(&self, model: &GraceModel) -> Result<SeedStructures, ConfigError> {
+    pub fn seed_structures(&self, model: &dyn ModelWithFeatures) -> Result<SeedStructures, ConfigError> {
         let frames = self.read_seed_structures()?.into_iter();
         let examined = all_cores::map(
             frames,
@@ -183,7 +183,11 @@ impl Loader<'_> {
 
     /// Checks that a walk can start and collect: the model knows the elements, no atoms overlap, each atom has a
     /// neighbour, there are as many atoms as the collection rule requires, and a volume ramp has a cell.
-    fn check_seed_structure(&self, structure: &Structure, model: &GraceModel) -> Result<Geometry, String> {
+    fn check_seed_structure(
+        &self,
+        structure: &Structure,
+        model: &dyn ModelWithFeatures,
+    ) -> Result<Geometry, String> {
         model.element_indices(&structure.species).map_err(|error| error.to_string())?;
         let geometry = Geometry::new(structure, model.cutoff()).map_err(|error| error.to_string())?;
         if let Some(contact) = self.config.guard.min_distances.prevents_start(&geometry.shortest) {

@@ -1,12 +1,12 @@
 //! What there is to know about each seed structure before its walks start.
 
 use std::collections::BTreeSet;
-use std::sync::Arc;
 
 use atoms::{ElementPair, NeighbourList, Species, Structure};
 use calm::rules::count_above;
 use calm::{Grades, Mixture};
-use potentials::grace::Grace;
+use potentials::PotentialWithFeatures;
+use potentials::grace::Threads;
 
 use super::{LoadedCampaign, SourcedStructure};
 use crate::all_cores;
@@ -68,16 +68,17 @@ pub fn triage(campaign: &LoadedCampaign, on_graded: impl Fn() + Sync) -> Vec<See
 /// Examines one seed structure after another.
 struct Examiner<'a> {
     campaign: &'a LoadedCampaign,
-    grace: Grace,
+    potential: Box<dyn PotentialWithFeatures>,
     neighbours: NeighbourList,
     grades: Grades,
 }
 
 impl<'a> Examiner<'a> {
     fn new(campaign: &'a LoadedCampaign) -> Self {
-        let model = Arc::clone(&campaign.model);
+        let model = campaign.model.shared();
         let neighbours = NeighbourList::new(model.cutoff(), 0.0);
-        Self { campaign, grace: Grace::new(model), neighbours, grades: Grades::default() }
+        let potential = model.evaluator(Threads::default());
+        Self { campaign, potential, neighbours, grades: Grades::default() }
     }
 
     fn examine(&mut self, seed_structure: &'a SourcedStructure) -> SeedStructureTriage<'a> {
@@ -103,13 +104,13 @@ impl<'a> Examiner<'a> {
     }
 
     fn grade(&mut self, structure: &Structure) -> Result<(), String> {
-        let Self { campaign, grace, neighbours, grades } = self;
+        let Self { campaign, potential, neighbours, grades } = self;
         let elements =
-            grace.model().element_indices(&structure.species).map_err(|error| error.to_string())?;
+            potential.model().element_indices(&structure.species).map_err(|error| error.to_string())?;
         neighbours.update(structure).map_err(|error| error.to_string())?;
-        grace.forward(structure, neighbours).map_err(|error| error.to_string())?;
+        potential.forward(structure, neighbours).map_err(|error| error.to_string())?;
         grades
-            .evaluate(&campaign.artifact.mixture, &elements, grace.features(), None)
+            .evaluate(&campaign.artifact.mixture, &elements, potential.features(), None)
             .map_err(|error| error.to_string())
     }
 

@@ -3,13 +3,15 @@
 use std::path::{Path, PathBuf};
 
 use potentials::grace::GraceModel;
+use wire::ipc::CallAddress;
 
 use super::LoadedCampaign;
 use super::loader::Loader;
 use crate::config::{ConfigError, RefitSection, TestSetSection};
 use crate::exit_status::CommandError;
 use crate::file_hash;
-use crate::process_config::{HashedFile, ModelFiles};
+use crate::loaded_model::LoadedModel;
+use crate::process_config::{DeviceModel, HashedFile, ModelFiles, WalkerModel};
 use crate::refit::settings::{RefitSettings, TestSet};
 use crate::versions::VersionOnDisk;
 
@@ -60,6 +62,16 @@ impl LoadedCampaign {
         let has_artifact = self.version.is_some() || self.config.calm.artifact.is_some();
         let artifact = (has_artifact && !projected).then(|| self.mixture_file()).transpose()?;
         Ok(ModelFiles { export, artifact, precision: self.config.potential.precision })
+    }
+
+    /// What walkers of this host load the model from; `device`: where the calls of a model in Python go.
+    pub fn walker_model(&self, device: Option<&CallAddress>) -> Result<WalkerModel, CommandError> {
+        let (LoadedModel::Python(model), Some(address)) = (&self.model, device) else {
+            return Ok(WalkerModel::Grace(self.model_files()?));
+        };
+        let artifact = model.projection().is_some().then(|| self.mixture_file()).transpose()?;
+        let description = model.description().clone();
+        Ok(WalkerModel::Python(Box::new(DeviceModel { description, artifact, address: address.clone() })))
     }
 
     /// The section `[refit]` with absolute paths and hashes.

@@ -55,8 +55,7 @@ impl StepTimes {
         let mut settings = campaign.walk_settings();
         // Only the bias of the walk differs from that of its control walk, and the volume is that of the seed structure.
         (settings.equilibration_steps, settings.biased_steps) = (0, u64::MAX);
-        let context =
-            WalkContext { model: Arc::clone(&campaign.model), threads, settings: Arc::new(settings) };
+        let context = WalkContext { model: campaign.model.shared(), threads, settings: Arc::new(settings) };
         let mixture = Arc::new(campaign.artifact.mixture.clone());
         let mut sizes: BTreeMap<u32, Vec<&SourcedStructure>> = BTreeMap::new();
         for seed in &campaign.seed_structures {
@@ -156,7 +155,9 @@ fn step_time(
         let steps = ends.borrow().len();
         steps > MEASURED_STEPS || steps > 1 && begun.elapsed() > LONGEST_MEASUREMENT
     };
-    advance(context, &assignment, Arc::clone(mixture), is_enough, |_| ends.borrow_mut().push(Instant::now()));
+    let on_step = |_| ends.borrow_mut().push(Instant::now());
+    // A model that does not answer has no steps.
+    let _ = advance(context, &assignment, Arc::clone(mixture), is_enough, on_step);
     // Other processes may interrupt some steps, and the first one also fills caches.
     let ends = ends.into_inner();
     let mut times: Vec<_> = ends.windows(2).map(|pair| (pair[1] - pair[0]).as_secs_f64()).collect();

@@ -8,12 +8,12 @@ use atoms::extxyz::write_frame;
 use calm::Projection;
 use calm::rules::Positive;
 use calm::selection::Window;
-use potentials::grace::GraceModel;
 use serde_json::{Value, json};
 
 use super::calm::load;
 use super::{CommandError, ExitStatus, campaign_location};
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
+use crate::loaded_model::LoadedModel;
 use crate::output::{TextTable, count, decimals, print, print_json, print_stderr};
 use crate::selection::{
     CampaignCandidates, CandidateChoice, FeatureIdentity, GradedPool, Pick, Picks, PoolFiles, PoolGrading,
@@ -133,7 +133,7 @@ impl SelectArgs {
         }
         let mut pool = PoolFiles { files, campaigns: self.campaigns(projection)? };
         let grading = PoolGrading {
-            model: Arc::clone(&model),
+            model: model.shared(),
             mixture: Arc::clone(&mixture),
             window,
             all_atoms: parts.iter().any(|part| part.strategy == Strategy::FarthestPointsAll),
@@ -259,7 +259,7 @@ fn all_cores() -> usize {
 /// What is said of a selection.
 struct SelectionReport<'a> {
     command: &'a SelectArgs,
-    model: &'a GraceModel,
+    model: &'a LoadedModel,
     files: &'a PoolFiles,
     pool: &'a GradedPool,
     rules: &'a Rules,

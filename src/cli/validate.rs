@@ -73,7 +73,7 @@ fn write_seed_structures(
 fn write(out: &mut dyn Write, path: &Path, campaign: &LoadedCampaign) -> io::Result<()> {
     let LoadedCampaign { model, artifact: Artifact { mixture, .. }, seed_structures, .. } = campaign;
     let elements: Vec<_> = model.elements().iter().map(|species| species.symbol()).collect();
-    let architecture = model.description().architecture;
+    let architecture = model.architecture();
     let atoms = || seed_structures.iter().map(|named| named.plan.structure.len());
     let (min, max) = (atoms().min().unwrap_or(0), atoms().max().unwrap_or(0));
     writeln!(out, "{} is a valid campaign", path.display())?;

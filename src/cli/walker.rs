@@ -26,7 +26,8 @@ impl WalkerArgs {
         launcher::end_with_parent(setup.parent).map_err(CommandError::failed)?;
         let stopping = signals::stop_token()?;
         let threads = Threads::new(setup.threads).map_err(CommandError::failed)?;
-        let context = WalkContext { model: setup.model.load()?, threads, settings: Arc::new(setup.settings) };
+        let model = setup.model.load(&stopping)?;
+        let context = WalkContext { model, threads, settings: Arc::new(setup.settings) };
         let mut transport =
             IpcWalker::connect(&setup.connect_info, stopping).map_err(CommandError::failed)?;
         let ended = walker::run(&context, &mut transport);
@@ -34,6 +35,7 @@ impl WalkerArgs {
             (_, Some(failure)) => Err(CommandError::failed(failure)),
             (walker::WalkerExit::Dismissed, None) => Ok(ExitStatus::Done),
             (walker::WalkerExit::Stopped, None) => Ok(ExitStatus::Interrupted),
+            (walker::WalkerExit::PotentialUnavailable(reason), None) => Err(CommandError::Failed(reason)),
         }
     }
 }

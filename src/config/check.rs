@@ -25,6 +25,7 @@ const MAX_REPEATS: u32 = 1000;
 pub fn check(config: &Config) -> Vec<InvalidValue> {
     let checks = [
         check_mixture(config),
+        check_python(config),
         check_thermostat(config),
         check_min_distances(config),
         check_zbl(config),
@@ -177,6 +178,23 @@ fn check_mixture(config: &Config) -> Result<(), InvalidValue> {
         let expected = "the gmm_artifacts.npz of the model: an export alone has no scatter matrices and counts, so its \
                         mixture can be scored with but not updated (with update = \"never\" the artifact may be left out)";
         return wrong("calm.artifact", "left out", expected);
+    }
+    Ok(())
+}
+
+/// A program in Python has no mixture of its own, and this program does not train it.
+fn check_python(config: &Config) -> Result<(), InvalidValue> {
+    if config.potential.python.is_none() {
+        return Ok(());
+    }
+    if config.calm.artifact.is_none() {
+        let expected =
+            "the artifact of a mixture for this model: build one with calmwalk calm build --model CONFIG";
+        return wrong("calm.artifact", "left out", expected);
+    }
+    if config.refit.is_some() {
+        let expected = "left out with [potential.python]: refits train exported GRACE models";
+        return wrong("refit", "a section", expected);
     }
     Ok(())
 }

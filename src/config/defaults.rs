@@ -138,3 +138,19 @@ pub fn max_held_out_error_ratio() -> Positive {
 pub fn refit_attempts() -> NonZeroU32 {
     nonzero(3)
 }
+
+pub fn python_device() -> String {
+    bridge::PythonDevice::default().0
+}
+
+pub fn max_batch() -> NonZeroU32 {
+    nonzero(32)
+}
+
+pub fn python_timeout() -> Duration {
+    Duration::from_seconds(60)
+}
+
+pub fn compile_timeout() -> Duration {
+    Duration::from_seconds(600)
+}

@@ -15,6 +15,7 @@ mod method;
 #[cfg(test)]
 mod mutated;
 mod notify;
+mod python;
 mod ranges;
 mod refit;
 mod schema;
@@ -42,6 +43,7 @@ pub use files::{PotentialConfig, PotentialKind};
 pub use hints::KnownKeys;
 pub use method::LabelMethod;
 pub use notify::{NotifyEvent, NotifySection};
+pub use python::PythonSection;
 pub use ranges::{impossible, usual_range};
 pub use refit::*;
 pub use schema::schema_text;
@@ -163,11 +165,32 @@ impl Config {
         Ok(label)
     }
 
+    /// Reads the `[potential]` section alone, of a configuration that needs no other.
+    pub fn load_potential(path: &Path) -> Result<PotentialSection, ConfigError> {
+        #[derive(Deserialize)]
+        struct PotentialDocument {
+            potential: PotentialSection,
+        }
+        let text = read_text(path)?;
+        let mut document = Document::parse(path, &text)?;
+        let read: Option<PotentialDocument> = document.read(PLACEHOLDERS, &Self::known_keys());
+        document.check_ranges("walk");
+        document.finish()?;
+        let PotentialDocument { mut potential } = read.ok_or_else(|| ConfigError::unreadable(path))?;
+        let directory = path.parent().unwrap_or(Path::new(""));
+        *potential.model.get_mut() = directory.join(potential.model.get_ref());
+        if let Some(python) = &mut potential.python {
+            python.resolve_paths(directory);
+        }
+        Ok(potential)
+    }
+
     /// The keys of each section.
     fn known_keys() -> KnownKeys {
         KnownKeys::new()
             .with::<CampaignSection>("campaign")
             .with::<PotentialSection>("potential")
+            .with::<PythonSection>("potential.python")
             .with::<CalmSection>("calm")
             .with::<SeedStructuresSection>("seed_structures")
             .with::<WalkSection>("walk")
@@ -212,6 +235,9 @@ impl Config {
 
     fn resolve_paths(&mut self, directory: &Path) {
         self.paths().for_each(|path| *path = directory.join(&*path));
+        if let Some(python) = &mut self.potential.python {
+            python.resolve_paths(directory);
+        }
         self.notify.resolve_paths(directory);
         if let Some(program) = self.refit.as_mut().and_then(RefitSection::program_path) {
             *program = directory.join(&*program).to_string_lossy().into_owned();

@@ -18,7 +18,7 @@ use store::LowerStateRule;
 use toml::Spanned;
 use workers::labeller::{BatchSystem, ExecutionSettings, KeepDirectories, LabelBounds, LabelGuard};
 
-use super::{LabelMethod, defaults, schema};
+use super::{LabelMethod, PythonSection, defaults, schema};
 use crate::duration::Duration;
 
 /// `[campaign]`
@@ -40,12 +40,15 @@ pub struct CampaignSection {
 #[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PotentialSection {
-    /// File of the exported GRACE model (`kokkos.npz`).
+    /// File of the exported GRACE model (`kokkos.npz`), or with `[potential.python]` the model's file or directory for the adapter.
     #[schemars(with = "PathBuf")]
     pub model: Spanned<PathBuf>,
     /// Floating-point precision in which walkers evaluate the model.
     #[serde(default)]
     pub precision: Precision,
+    /// A model that its own framework evaluates, in Python. Default: none; calmwalk evaluates the exported GRACE model.
+    #[serde(default)]
+    pub python: Option<PythonSection>,
 }
 
 /// `[calm]`

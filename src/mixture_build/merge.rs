@@ -5,7 +5,6 @@ use std::path::Path;
 
 use calm::Projection;
 use calm::build::{BuildSettings, BuiltMixture};
-use potentials::grace::GraceModel;
 
 use super::clustering::Clustered;
 use super::identity::Identity;
@@ -51,14 +50,14 @@ impl PartsMerge {
     /// One of its parts is not done; the parts had another projection.
     pub fn run(
         &mut self,
-        model: &GraceModel,
+        symbols: Vec<String>,
         projection: Projection,
         projection_seed: Option<i64>,
     ) -> Result<Merged, CommandError> {
         let same = self.identity.check_projection(&projection);
         same.map_err(|difference| self.state.other_build(&difference))?;
         let Some(partition) = self.state.partition()? else {
-            let partition = self.pass_1()?.combine(&self.identity.settings, model.elements().len())?;
+            let partition = self.pass_1()?.combine(&self.identity.settings, symbols.len())?;
             self.state.save_partition(&partition)?;
             return Ok(Merged::Pass(1));
         };
@@ -72,7 +71,7 @@ impl PartsMerge {
         let settings = self.identity.settings.clone();
         let components = components_from_sums(settings.dimension, &partition, of_pass_2.elements)?;
         let histograms = histograms_from_sums(of_pass_3.elements)?;
-        let built = mixture(model, projection, projection_seed, settings, components, histograms)?;
+        let built = mixture(symbols, projection, projection_seed, settings, components, histograms)?;
         Ok(Merged::Mixture(Box::new(built)))
     }
 

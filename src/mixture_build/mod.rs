@@ -24,7 +24,6 @@ use calm::Projection;
 use calm::build::{
     BuildSettings, BuiltComponent, BuiltElement, BuiltMixture, ElementHistograms, ShardClustering,
 };
-use potentials::grace::GraceModel;
 
 use self::feature_cache::FeatureCache;
 use self::identity::Identity;
@@ -98,7 +97,7 @@ impl MixtureBuild {
         let Some(components) = self.components(&partition)? else { return Ok(None) };
         let Some(histograms) = self.histograms(&partition, &components)? else { return Ok(None) };
         let settings = self.settings.clone();
-        mixture(&self.context.model.model, projection, projection_seed, settings, components, histograms)
+        mixture(self.context.model.symbols(), projection, projection_seed, settings, components, histograms)
             .map(Some)
     }
 
@@ -134,7 +133,7 @@ impl MixtureBuild {
 
 /// The mixture of the results of all passes, by element index.
 fn mixture(
-    model: &GraceModel,
+    symbols: Vec<String>,
     projection: Projection,
     projection_seed: Option<i64>,
     settings: BuildSettings,
@@ -144,7 +143,6 @@ fn mixture(
     let elements = components.into_iter().zip(histograms).map(|(components, histograms)| {
         Some(BuiltElement { components: components?, histograms: histograms? })
     });
-    let symbols = model.elements().iter().map(|element| element.symbol().to_owned()).collect();
     BuiltMixture::new(symbols, projection, projection_seed, settings, elements.collect())
         .map_err(CommandError::failed)
 }

@@ -112,7 +112,7 @@ impl FeatureSource<'_> {
                 Ok(Some((elements, features)))
             }
             Self::Stored { reader, model } => {
-                let elements = model.model.element_indices(&training.structure.species);
+                let elements = model.model.shared().element_indices(&training.structure.species);
                 let elements = elements.map_err(|error| training.position.wrong(error))?;
                 let features = reader.next(elements.len() * model.dimension());
                 Ok(features.map(|features| (elements, features)))

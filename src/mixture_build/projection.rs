@@ -5,10 +5,10 @@ use std::path::Path;
 use calm::Projection;
 use calm::build::random_projection;
 use npz::NpzFile;
-use potentials::grace::GraceModel;
 
 use crate::exit_status::CommandError;
-use crate::feature_variant::{FeatureModel, FeatureVariant, with_projection};
+use crate::feature_variant::{FeatureModel, FeatureVariant};
+use crate::loaded_model::LoadedModel;
 
 /// Projected features of a model without a projection, as in the paper.
 pub const PROJECTED: usize = 128;
@@ -17,13 +17,13 @@ pub const PROJECTED: usize = 128;
 /// projection gets a random one with `dimension` projected features.
 pub fn projected(
     path: &Path,
-    mut model: GraceModel,
+    mut model: LoadedModel,
     variant: Option<FeatureVariant>,
     seed: u64,
     dimension: usize,
 ) -> Result<(FeatureModel, Projection, Option<i64>), CommandError> {
     let needs_projection = variant != Some(FeatureVariant::Hidden);
-    let seed = if !needs_projection {
+    let seed = if !needs_projection || model.has_final_features() {
         None
     } else if model.projection().is_some() {
         let file = NpzFile::open(path).map_err(CommandError::input)?;
@@ -31,10 +31,14 @@ pub fn projected(
         let seed = file.contains(key).then(|| file.integers(key)).transpose().map_err(CommandError::input)?;
         seed.and_then(|seed| seed.data.first().copied())
     } else {
-        let description = model.description();
-        let (rows, layers) = (description.basis_dimension, description.architecture.layers());
+        let (rows, layers) = model.basis().ok_or_else(|| {
+            CommandError::Input(format!(
+                "{}: the model has no features, so nothing can be graded",
+                path.display()
+            ))
+        })?;
         let drawn = random_projection(seed, rows, dimension, layers);
-        model = with_projection(model, &drawn).map_err(CommandError::failed)?;
+        model = model.with_projection(&drawn).map_err(CommandError::Failed)?;
         i64::try_from(seed).ok()
     };
     let found = FeatureModel::new(path, model, variant)?;

@@ -63,9 +63,14 @@ pub async fn build(
     let artifact = write_beside(&built, output)?;
     let original = Artifact::load(&artifact).map_err(CommandError::failed)?;
     check_sound(&original, output).map_err(RefitFailure::Refused)?;
-    let updated =
-        unlabelled_updates::apply_others(store, &found.model, original.mixture.clone(), trained_on, stop)
-            .await?;
+    let updated = unlabelled_updates::apply_others(
+        store,
+        &found.model.shared(),
+        original.mixture.clone(),
+        trained_on,
+        stop,
+    )
+    .await?;
     let Some(updated) = updated else { return Ok(None) };
     let version =
         ArtifactVersion::new(&artifact, &original.mixture, &updated.mixture).map_err(CommandError::failed)?;
@@ -89,7 +94,7 @@ fn model(
         let projection = Projection::load(&config.parent_mixture.path).map_err(CommandError::input)?;
         model = with_projection(model, &projection).map_err(RefitFailure::refused)?;
     }
-    let found = projected(path, model, None, config.rng_seed, PROJECTED);
+    let found = projected(path, model.into(), None, config.rng_seed, PROJECTED);
     let (found, projection, seed) = found.map_err(RefitFailure::of_input)?;
     Ok((found, projection, seed.filter(|_| is_its_own)))
 }

@@ -27,7 +27,7 @@ use crate::exit_status::{CommandError, ExitStatus};
 use crate::file_hash::verify_hash;
 use crate::log;
 use crate::output::{count, log_and_print, log_and_warn};
-use crate::process_config::{self, AgentConfig, HashedFile, ModelFiles, WalkerConfig};
+use crate::process_config::{self, AgentConfig, HashedFile, ModelFiles, WalkerConfig, WalkerModel};
 use crate::signals::cancel_on_signal;
 use crate::web::agent_metrics::AgentState;
 
@@ -235,7 +235,7 @@ fn launch(
         let setup = WalkerConfig {
             parent,
             connect_info: line.connect_info(number, incarnation),
-            model: setup.model.clone(),
+            model: WalkerModel::Grace(setup.model.clone()),
             threads,
             settings: setup.settings.clone(),
             log: log::child_config(),

@@ -6,6 +6,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
+use bridge::DeviceService;
 use orchestrator::launcher::Children;
 use orchestrator::reactor;
 use orchestrator::selector::Selector;
@@ -15,7 +16,7 @@ use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinHandle};
 use tokio::time::{Sleep, sleep};
 use tokio_util::sync::CancellationToken;
-use wire::ipc::{IpcServer, Sizes, space_needed};
+use wire::ipc::{IpcServer, Sizes, call_space_needed, space_needed};
 use wire::mixture::SharedMixture;
 use wire::net::StopTokens;
 use wire::shm_dir::ShmDir;
@@ -60,11 +61,17 @@ async fn run_in(
     let sizes = Sizes { walkers, message_bytes: campaign.largest_message() };
     let needed =
         SharedMixture::space_needed(&mixture, walkers).map_err(CommandError::failed)? + space_needed(&sizes);
+    let device = campaign.model.device();
+    // A reply has the features of all atoms, as a candidate has.
+    let words = campaign.largest_message() / 8;
+    let needed = needed + device.map_or(0, |_| call_space_needed(walkers, words));
     let _prepared = place.prepare(needed).map_err(CommandError::failed)?;
     let shared = SharedMixture::create(&place.mixture(), &mixture, walkers);
     let shared = shared.map_err(CommandError::failed)?;
     let server = IpcServer::open(place, sizes, session(process)).map_err(CommandError::failed)?;
 
+    let calls = device.map(|device| DeviceService::open(device, place, session(process), walkers, words));
+    let calls = calls.transpose().map_err(CommandError::failed)?;
     // The manager cancels it too, when the run cannot go on.
     let stopping = run.stop.child_token();
     let limits = Limits {
@@ -73,7 +80,11 @@ async fn run_in(
         ..Limits::default()
     };
     let line = server.handle();
-    let walkers = Children::new(walkers, limits, spawn::walker_launcher(campaign, line.clone())?);
+    let walkers = Children::new(
+        walkers,
+        limits,
+        spawn::walker_launcher(campaign, line.clone(), calls.as_ref().map(DeviceService::address))?,
+    );
     let limits = Limits {
         heartbeat_timeout: limits.heartbeat_timeout.max(LABELLER_TIMEOUT),
         detached: true,

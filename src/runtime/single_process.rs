@@ -148,7 +148,7 @@ fn start_walkers(
     to_reactor: &mpsc::Sender<Incoming>,
     stopping: &CancellationToken,
 ) -> Result<Vec<JoinHandle<walker::WalkerExit>>, CommandError> {
-    let (model, settings) = (Arc::clone(&campaign.model), Arc::new(campaign.walk_settings()));
+    let (model, settings) = (campaign.model.shared(), Arc::new(campaign.walk_settings()));
     let start = |number| {
         let mut transport = InProcess::new(number, to_reactor.clone(), stopping.clone());
         let threads =

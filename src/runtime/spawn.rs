@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use orchestrator::launcher::{Children, Launch, request_exit};
 use orchestrator::supervisor::Limits;
 use store::{ProcessRecord, Store, StoreError};
-use wire::ipc::ServerHandle;
+use wire::ipc::{CallAddress, ServerHandle};
 
 use super::RunContext;
 use super::labellers::Labellers;
@@ -20,8 +20,9 @@ use crate::process_config::{self, LabellerConfig, WalkerConfig};
 pub fn walker_launcher(
     campaign: &LoadedCampaign,
     line: ServerHandle,
+    device: Option<&CallAddress>,
 ) -> Result<impl FnMut(u32, u32) -> Launch + Send + 'static, CommandError> {
-    let model = campaign.model_files()?;
+    let model = campaign.walker_model(device)?;
     let (parent, settings) = (std::process::id(), campaign.walk_settings());
     let threads = campaign.config.run.threads_per_walker.get();
     Ok(move |number, incarnation| {

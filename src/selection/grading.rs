@@ -8,7 +8,7 @@ use std::thread;
 
 use calm::selection::{Pool, Window};
 use calm::{Grades, Mixture};
-use potentials::grace::GraceModel;
+use potentials::ModelWithFeatures;
 use tokio_util::sync::CancellationToken;
 use wire::ContentHash;
 
@@ -33,7 +33,7 @@ pub struct PoolFiles {
 
 /// How a pool is graded, and what is kept of it.
 pub struct PoolGrading {
-    pub model: Arc<GraceModel>,
+    pub model: Arc<dyn ModelWithFeatures>,
     pub mixture: Arc<Mixture>,
     pub window: Window,
     /// Keep the features of atoms outside the window.
@@ -141,14 +141,14 @@ impl Worker {
         let size = item.structure.len() * mixture.dimension();
         let (elements, features) = match &item.features {
             Some(features) => {
-                let model = self.calculator.grace.model();
+                let model = self.calculator.potential.model();
                 let elements =
                     model.element_indices(&item.structure.species).map_err(|error| wrong(&error))?;
                 (elements, features.clone())
             }
             None => {
                 let elements = self.calculator.compute(&item.structure).map_err(|error| wrong(&error))?;
-                (elements, self.calculator.grace.features()[..size].to_vec())
+                (elements, self.calculator.potential.features()[..size].to_vec())
             }
         };
         self.grades.evaluate(mixture, &elements, &features, None).map_err(|error| wrong(&error))?;

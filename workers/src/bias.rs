@@ -8,8 +8,8 @@ use std::sync::Arc;
 
 use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, Vec3, cell};
 use calm::{BatchedGrades, GradeError, Grades, Mixture};
-use potentials::Zbl;
-use potentials::grace::{Grace, PullBack};
+use potentials::grace::PullBack;
+use potentials::{PotentialWithFeatures, Zbl};
 use serde::{Deserialize, Serialize};
 
 /// State of the bias, part of a walk's checkpoint.
@@ -47,9 +47,9 @@ pub enum UngradedError {
     Grade(#[from] GradeError),
 }
 
-/// A GRACE potential with bias and short-range repulsion.
+/// A potential with features, with bias and short-range repulsion.
 pub struct BiasedPotential {
-    grace: Grace,
+    potential: Box<dyn PotentialWithFeatures>,
     elements: Vec<usize>,
     zbl: Option<Zbl>,
     mixture: Arc<Mixture>,
@@ -72,15 +72,15 @@ impl BiasedPotential {
     /// # Errors
     /// An element that the model does not know.
     pub fn new(
-        grace: Grace,
+        potential: Box<dyn PotentialWithFeatures>,
         mixture: Arc<Mixture>,
         zbl: Option<Zbl>,
         bias_averaging_steps: u64,
         species: &[Species],
     ) -> Result<Self, PotentialError> {
-        let elements = grace.model().element_indices(species)?;
+        let elements = potential.model().element_indices(species)?;
         Ok(Self {
-            grace,
+            potential,
             elements,
             zbl,
             mixture,
@@ -101,7 +101,7 @@ impl BiasedPotential {
 
     /// Features of the atoms that [`BiasedPotential::grades`] graded, [n × D].
     pub fn features(&self) -> &[f64] {
-        self.grace.features()
+        self.potential.features()
     }
 
     /// Element index of each atom.
@@ -122,8 +122,8 @@ impl BiasedPotential {
         if self.tau != 0.0 {
             return Ok(self.parts.finish()?);
         }
-        self.grace.forward(structure, neighbours)?;
-        self.grades.evaluate(&self.mixture, &self.elements, self.grace.features(), None)?;
+        self.potential.forward(structure, neighbours)?;
+        self.grades.evaluate(&self.mixture, &self.elements, self.potential.features(), None)?;
         Ok(&self.grades)
     }
 
@@ -133,12 +133,12 @@ impl BiasedPotential {
         neighbours: &NeighbourList,
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
-        let Self { grace, mixture, elements, parts, pull_back, .. } = self;
+        let Self { potential, mixture, elements, parts, pull_back, .. } = self;
         parts.begin(elements.len());
         let grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
             parts.add(mixture, elements, atoms, features, cotangent);
         };
-        grace.evaluate_graded(structure, neighbours, &grade, out, Some(pull_back))?;
+        potential.evaluate_graded(structure, neighbours, &grade, out, Some(pull_back))?;
         copy(out, &mut self.physical);
         if self.parts.finish().is_ok() {
             self.add_bias(out);
@@ -161,11 +161,11 @@ impl BiasedPotential {
 
 impl Potential for BiasedPotential {
     fn cutoff(&self) -> f64 {
-        self.grace.cutoff()
+        self.potential.cutoff()
     }
 
     fn species(&self) -> &[Species] {
-        self.grace.species()
+        self.potential.species()
     }
 
     fn evaluate(
@@ -175,7 +175,7 @@ impl Potential for BiasedPotential {
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
         if self.tau == 0.0 {
-            self.grace.evaluate(structure, neighbours, out)?;
+            self.potential.evaluate(structure, neighbours, out)?;
             copy(out, &mut self.physical);
         } else {
             self.evaluate_biased(structure, neighbours, out)?;

@@ -12,8 +12,8 @@ use std::sync::Arc;
 use atoms::ShortestDistances;
 use calm::{CollectionRule, Mixture};
 use md::{Dynamics, Stream};
-use potentials::Zbl;
-use potentials::grace::{Grace, GraceModel, Instructions, Threads};
+use potentials::grace::Threads;
+use potentials::{ModelWithFeatures, Zbl};
 use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd, WalkProgress};
 use wire::{Candidate, Origin};
 
@@ -27,7 +27,7 @@ use state::{CollectionPoint, WalkState, start};
 #[derive(Clone)]
 pub struct WalkContext {
     /// The model.
-    pub model: Arc<GraceModel>,
+    pub model: Arc<dyn ModelWithFeatures>,
     /// The threads that evaluate the model.
     pub threads: Threads,
     /// The settings.
@@ -36,45 +36,58 @@ pub struct WalkContext {
 
 /// Runs an assignment until it ends: with a candidate, at its last step, with the end of the walk, or when
 /// `stopping` returns true. Calls `on_progress` with the progress after each step.
+///
+/// # Errors
+/// The program that evaluates the potential does not answer any more. The assignment is as it was: another walker may run it.
 pub fn advance(
     context: &WalkContext,
     assignment: &Assignment,
     mixture: Arc<Mixture>,
     stopping: impl Fn() -> bool,
     on_progress: impl Fn(WalkProgress),
-) -> AssignmentReport<Candidate> {
+) -> Result<AssignmentReport<Candidate>, PotentialUnavailable> {
     let (walk, number) = (assignment.walk, assignment.number);
     let mut running = match RunningWalk::start_or_resume(context, assignment, mixture) {
         Ok(running) => running,
+        Err(WalkError::Unavailable(reason)) => return Err(PotentialUnavailable(reason)),
         Err(error) => {
             let end = WalkEnd::InvalidStart { reason: error.to_string() };
             let checkpoint = assignment.checkpoint.clone().unwrap_or_default();
-            return AssignmentReport {
+            return Ok(AssignmentReport {
                 walk,
                 assignment: number,
                 outcome: Outcome::Ended(end),
                 checkpoint,
                 progress: WalkProgress::default(),
-            };
+            });
         }
     };
-    let outcome = running.run(&stopping, &on_progress).unwrap_or_else(|error| {
-        Outcome::Ended(WalkEnd::Diverged { reason: format!("at step {}: {error}", running.step()) })
-    });
-    AssignmentReport {
+    let outcome = match running.run(&stopping, &on_progress) {
+        Ok(outcome) => outcome,
+        Err(WalkError::Unavailable(reason)) => return Err(PotentialUnavailable(reason)),
+        Err(error) => {
+            Outcome::Ended(WalkEnd::Diverged { reason: format!("at step {}: {error}", running.step()) })
+        }
+    };
+    Ok(AssignmentReport {
         walk,
         assignment: number,
         outcome,
         checkpoint: running.encode(),
         progress: running.progress(),
-    }
+    })
 }
+
+/// The program that evaluates the potential does not answer any more.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct PotentialUnavailable(pub String);
 
 /// A walk during an assignment.
 struct RunningWalk<'a> {
     settings: &'a WalkSettings,
     assignment: &'a Assignment,
-    model: &'a GraceModel,
+    model: &'a dyn ModelWithFeatures,
     mixture_version: u64,
     /// The collection rule of this assignment.
     collection: CollectionRule,
@@ -94,8 +107,8 @@ impl<'a> RunningWalk<'a> {
         let zbl = settings.zbl.as_ref().map(|windows| Zbl::new(species, windows)).transpose()?;
         let mixture_version = mixture.version();
         let bias_averaging_steps = settings.bias_averaging_steps;
-        let grace = Grace::with(Arc::clone(model), Instructions::best(), threads.clone());
-        let mut potential = BiasedPotential::new(grace, mixture, zbl, bias_averaging_steps, species)?;
+        let evaluator = Arc::clone(model).evaluator(threads.clone());
+        let mut potential = BiasedPotential::new(evaluator, mixture, zbl, bias_averaging_steps, species)?;
         let (dynamics, state) = match &assignment.checkpoint {
             None => start(settings, assignment, &mut potential)?,
             Some(bytes) => {
@@ -106,8 +119,16 @@ impl<'a> RunningWalk<'a> {
         };
         potential.state = state.bias;
         let collection = settings.collection.with_threshold_factor(assignment.threshold_factor);
-        let mut walk =
-            Self { settings, assignment, model, mixture_version, collection, dynamics, potential, state };
+        let mut walk = Self {
+            settings,
+            assignment,
+            model: &**model,
+            mixture_version,
+            collection,
+            dynamics,
+            potential,
+            state,
+        };
         walk.apply_verdict();
         Ok(walk)
     }

@@ -9,18 +9,20 @@ use wire::Candidate;
 use wire::messages::{AssignmentReport, Outcome, WalkEnd, WalkProgress};
 use wire::transport::{Transport, WorkItem};
 
-use crate::walk::{WalkContext, advance};
+use crate::walk::{PotentialUnavailable, WalkContext, advance};
 
 /// Minimum time between two progress reports; longer steps make it longer.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Why a walker ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum WalkerExit {
     /// There was no more work.
     Dismissed,
     /// It was asked to stop. Another walker gets its last assignment, if it had one.
     Stopped,
+    /// The program that evaluates the potential does not answer any more. Its last assignment is not reported.
+    PotentialUnavailable(String),
 }
 
 /// Works on assignments until there are no more or the walker is asked to stop.
@@ -33,7 +35,12 @@ pub fn run(context: &WalkContext, transport: &mut impl Transport) -> WalkerExit 
         // A panic is a defect of this program. It ends the walk that caused it, not the campaign.
         let started = Instant::now();
         let result = catch_unwind(AssertUnwindSafe(|| run_assignment(context, &work, transport)));
-        let made = result.unwrap_or_else(|_| crash_report(&work));
+        let made = match result {
+            Ok(Ok(made)) => made,
+            Ok(Err(_)) if transport.stopping() => return WalkerExit::Stopped,
+            Ok(Err(PotentialUnavailable(reason))) => return WalkerExit::PotentialUnavailable(reason),
+            Err(_) => crash_report(&work),
+        };
         log_outcome(&work, &made, started.elapsed());
         report = Some(made);
     }
@@ -44,7 +51,7 @@ fn run_assignment(
     context: &WalkContext,
     work: &WorkItem,
     transport: &impl Transport,
-) -> AssignmentReport<Candidate> {
+) -> Result<AssignmentReport<Candidate>, PotentialUnavailable> {
     let walk = work.assignment.walk;
     let stopping = || transport.stopping();
     let last = Cell::new(Instant::now());

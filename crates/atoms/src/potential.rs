@@ -63,6 +63,12 @@ pub enum PotentialError {
         /// Cutoff of the potential, Å.
         needed: f64,
     },
+    /// The program that evaluates the potential cannot evaluate this structure.
+    #[error("{0}")]
+    Failed(String),
+    /// The program that evaluates the potential does not answer any more.
+    #[error("{0}")]
+    Unavailable(String),
 }
 
 /// An interatomic potential. `&mut self` lets implementations keep scratch arrays between steps.

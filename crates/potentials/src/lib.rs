@@ -3,6 +3,7 @@
 mod eam;
 mod eam_pairs;
 mod eam_spline;
+mod features;
 pub mod grace;
 mod near_pairs;
 mod pairs;
@@ -14,6 +15,7 @@ mod zbl;
 mod zbl_windows;
 
 pub use eam::Eam;
+pub use features::{ModelWithFeatures, PotentialWithFeatures};
 pub use potential_file::PotentialFileError;
 pub use setfl::EamStyle;
 pub use stillinger_weber::StillingerWeber;

@@ -55,10 +55,11 @@ impl<'a> FeatureMatch<'a> {
     }
 
     /// Gradients of combinations of the features of the last environment by the coordinates of its m neighbours, `[weights × 3m]`, 1/Å.
-    pub fn combined_gradients(&mut self, weights: &[Vec<f64>]) -> Vec<f64> {
+    /// `None` if the model does not answer.
+    pub fn combined_gradients(&mut self, weights: &[Vec<f64>]) -> Option<Vec<f64>> {
         let columns = 3 * self.calculator.features().len() / self.target.len();
-        let rows = self.calculator.combined_gradients(weights);
-        rows.chunks_exact(columns).flat_map(|row| &row[3..]).copied().collect()
+        let rows = self.calculator.combined_gradients(weights).ok()?;
+        Some(rows.chunks_exact(columns).flat_map(|row| &row[3..]).copied().collect())
     }
 
     /// The function for the coordinates of the neighbours, `[3m]`, Å; writes its gradient, 1/Å. `None` without features.
@@ -68,7 +69,7 @@ impl<'a> FeatureMatch<'a> {
         let size = square(&self.target);
         let mut cotangent = vec![0.0; self.calculator.features().len()];
         cotangent.iter_mut().zip(&deviations).for_each(|(c, deviation)| *c = 2.0 * deviation / size);
-        self.calculator.pull_back(&cotangent, &mut self.pull_back);
+        self.calculator.pull_back(&cotangent, &mut self.pull_back).ok()?;
         gradient.copy_from_slice(self.pull_back.gradient[1..].as_flattened());
         let (of_neighbours, _) = gradient.as_chunks_mut::<3>();
         Some(square(&deviations) / size + self.allowed.penalty(neighbours, of_neighbours))

@@ -53,7 +53,7 @@ impl NullSpaceWalk {
         matched.deviations(start)?;
         let mut weights = random_weights(self.max_rank + SURPLUS, matched.dimension(), random);
         let columns = 3 * start.len();
-        let values = singular_values(&matched.combined_gradients(&weights), columns)?;
+        let values = singular_values(&matched.combined_gradients(&weights)?, columns)?;
         let evaluations = 1 + weights.len();
         weights.truncate(rank(&values));
         let mut features = WalkedFeatures { matched, weights, evaluations };
@@ -78,7 +78,7 @@ impl NullSpaceWalk {
         direction: &mut Vec<f64>,
     ) -> Option<Vec<f64>> {
         let columns = point.len();
-        let rows = features.matched.combined_gradients(&features.weights);
+        let rows = features.matched.combined_gradients(&features.weights)?;
         features.evaluations += features.weights.len();
         let changing = RowSpace::new(&rows, columns)?;
         let rigid_too = RowSpace::new(&[rows, rotations(point)].concat(), columns)?;

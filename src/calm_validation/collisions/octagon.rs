@@ -83,8 +83,8 @@ impl Collision {
         let (first, second) = (of(OCTAGON[0], 0.0, 1.0)?, of(OCTAGON[1], 0.0, 1.0)?);
         let turned = of(OCTAGON[0], TURN, -1.0)?;
         let own = FeatureDistance::new("as graded", &first, &second, &turned, |z| z.to_vec());
-        let linear =
-            subject.model.projection().filter(|map| map.normalize && map.density_channels && !map.asinh);
+        let projection = subject.model.grace().and_then(|model| model.projection());
+        let linear = projection.filter(|map| map.normalize && map.density_channels && !map.asinh);
         let linear = linear
             .map(|map| FeatureDistance::new("linear", &first, &second, &turned, |z| linear_features(map, z)));
         Some(Self {
@@ -118,10 +118,10 @@ impl Environment {
     /// The first atom of a cluster. `None` if it cannot be graded.
     fn new(grader: &mut ValidationGrader, cluster: &Structure) -> Option<Self> {
         let graded = grader.grade(cluster).ok()?;
-        let grace = &grader.features.grace;
-        let features = grace.features()[..grace.model().feature_dimension()].to_vec();
+        let potential = &grader.features.potential;
+        let features = potential.features()[..potential.model().feature_dimension()].to_vec();
         let scores = graded.scores.iter().map(|of| of[0]).collect();
-        Some(Self { features, energy: grace.atomic_energies()[0], scores })
+        Some(Self { features, energy: potential.atomic_energies()[0], scores })
     }
 }
 

@@ -72,12 +72,12 @@ pub fn run(
     let found = all_cores::map(
         tasks.collect::<Vec<_>>().into_iter(),
         || {
-            let model = &subject.model;
-            [FeatureCalculator::of_hidden_layer(model.clone()), FeatureCalculator::new(model.clone())]
+            let hidden = subject.model.grace().cloned().map(FeatureCalculator::of_hidden_layer);
+            (hidden, FeatureCalculator::new(subject.model.shared()))
         },
-        |[hidden, graded], (species, (features, of_all))| {
+        |(hidden, graded), (species, (features, of_all))| {
             let calculator = match features {
-                MatchedFeatures::HiddenLayer => hidden,
+                MatchedFeatures::HiddenLayer => hidden.as_mut()?,
                 MatchedFeatures::Graded => graded,
             };
             let equilibrium = distances[species.symbol()];
@@ -97,7 +97,7 @@ fn examine(
     (species, equilibrium): (Species, f64),
     (features, of_all): (MatchedFeatures, bool),
 ) -> Option<FeatureRank> {
-    let allowed = allowed(calculator.grace.model(), species, equilibrium)?;
+    let allowed = allowed(calculator.potential.model(), species, equilibrium)?;
     let neighbours = first_environment(seed, (species, allowed), NEIGHBOURS)?;
     calculator.compute(&cluster(species, &neighbours)).ok()?;
     let number = 1 + neighbours.len();
@@ -106,7 +106,7 @@ fn examine(
     let sequence = SEQUENCES + u64::from(species.atomic_number());
     let mut random = RandomSequence::new(seed, sequence);
     let weights = random_weights(dimension.min(3 * number) + SURPLUS, dimension, &mut random);
-    let values = singular_values(&calculator.combined_gradients(&weights), 3 * number)?;
+    let values = singular_values(&calculator.combined_gradients(&weights).ok()?, 3 * number)?;
     let largest = values[0];
     let rank = rank(&values);
     Some(FeatureRank {

@@ -1,10 +1,12 @@
 //! Pairs found by minimisation: positions of the neighbours that give an atom the features of another environment (paper, SI1).
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use atoms::cell::norm;
 use atoms::{Evaluation, Species, Structure, Vec3};
-use potentials::grace::{GraceModel, PullBack};
+use potentials::ModelWithFeatures;
+use potentials::grace::PullBack;
 use serde::Serialize;
 
 use super::environments::{EnvironmentDifference, random_neighbours};
@@ -161,8 +163,9 @@ pub fn run(
     let found = all_cores::map(
         tasks(settings).into_iter(),
         || PairSearch::new(subject),
-        |calculators, (species, search)| {
-            let allowed = allowed(&subject.model, species, distances[species.symbol()]);
+        |search_of_model, (species, search)| {
+            let calculators = search_of_model.as_mut()?;
+            let allowed = allowed(&*subject.model.shared(), species, distances[species.symbol()]);
             let runs = (0..STARTS).filter_map(|start| {
                 calculators.minimise(settings, progress, (species, allowed?), (search, start))
             });
@@ -177,7 +180,11 @@ pub fn run(
 }
 
 /// Where neighbours may be. `None` for an element that the model does not know.
-pub fn allowed(model: &GraceModel, species: Species, equilibrium: f64) -> Option<AllowedDistances> {
+pub fn allowed(
+    model: &dyn ModelWithFeatures,
+    species: Species,
+    equilibrium: f64,
+) -> Option<AllowedDistances> {
     let element = *model.element_indices(&[species]).ok()?.first()?;
     let cutoff = model.pair_cutoff(element, element);
     let closest = (CLOSEST * equilibrium).min(ROOM * RADIUS * cutoff);
@@ -198,10 +205,11 @@ struct PairSearch {
 }
 
 impl PairSearch {
-    fn new(subject: &Subject) -> Self {
-        let hidden = FeatureCalculator::of_hidden_layer(subject.model.clone());
-        let densities = subject.model.density_dimension();
-        Self { grader: ValidationGrader::new(subject), hidden, densities }
+    /// `None` for a model without a readout that is known.
+    fn new(subject: &Subject) -> Option<Self> {
+        let model = subject.model.grace()?;
+        let hidden = FeatureCalculator::of_hidden_layer(Arc::clone(model));
+        Some(Self { grader: ValidationGrader::new(subject), hidden, densities: model.density_dimension() })
     }
 
     /// One minimisation. `None` if it was stopped, or if environments have no room or no grades.
@@ -267,11 +275,11 @@ impl PairSearch {
     /// Energy, force and scores of the first atom.
     fn environment(&mut self, cluster: &Structure) -> Option<MatchedEnvironment> {
         let graded = self.grader.grade(cluster).ok()?;
-        let grace = &mut self.grader.features.grace;
+        let potential = &mut self.grader.features.potential;
         let mut derivatives = Evaluation::default();
-        grace.backward(None, &mut derivatives, &mut PullBack::default());
+        potential.backward(None, &mut derivatives, &mut PullBack::default()).ok()?;
         Some(MatchedEnvironment {
-            energy: *grace.atomic_energies().first()?,
+            energy: *potential.atomic_energies().first()?,
             force: norm(*derivatives.forces.first()?),
             scores: graded.scores.iter().filter_map(|of| of.first().copied()).collect(),
         })

@@ -6,7 +6,6 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use calm::baselines::{Baseline, BaselineFile, BaselineKind, BaselineSettings, Builder};
 use calm::{Artifact, Mixture};
-use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
 use crate::artifact_checks::check_sound;
@@ -14,6 +13,7 @@ use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::{FeatureModel, FeatureVariant};
 use crate::features::FeatureCalculator;
+use crate::loaded_model::LoadedModel;
 use crate::output::{self, Bar, TextTable, print, print_stderr};
 use crate::signals::stop_token;
 use crate::structure_files::{FileLine, StructureArgs, StructureFiles};
@@ -150,7 +150,7 @@ impl CalmBaselineArgs {
         let features = match self.feature_variant {
             Some(_) => FeatureModel::load(&self.model, self.feature_variant)?,
             None => {
-                let model = GraceModel::load(&self.model).map_err(CommandError::input)?;
+                let model = LoadedModel::load(&self.model)?;
                 FeatureModel::for_artifact(&self.model, model, &artifact.projection)?
             }
         };
@@ -204,7 +204,11 @@ fn read(
         let elements = calculator.compute(&frame.structure).map_err(|error| position.wrong(error))?;
         let needs_forces =
             builders.iter().any(|builder| builder.needs_sweep() && builder.kind().has_force_form());
-        let rows = if needs_forces { calculator.force_rows() } else { Vec::new() };
+        let rows = if needs_forces {
+            calculator.force_rows().map_err(|error| position.wrong(error))?
+        } else {
+            Vec::new()
+        };
         for builder in builders.iter_mut().filter(|builder| builder.needs_sweep()) {
             builder.add(&elements, calculator.features()).map_err(|error| position.wrong(error))?;
             builder.add_forces(&rows).map_err(|error| position.wrong(error))?;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use calm::Projection;
 use calm::build::{BuildSettings, BuiltElement, BuiltMixture};
-use potentials::grace::GraceModel;
+use potentials::ModelWithFeatures;
 use tokio_util::sync::CancellationToken;
 
 use super::campaign_updates::UpdateSource;
@@ -13,7 +13,7 @@ use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::{FeatureModel, FeatureVariant};
-use crate::file_hash;
+use crate::loaded_model::LoadedModel;
 use crate::mixture_build::{BuildDefaults, BuildPart, MixtureBuild, PROJECTED, PassContext, projected};
 use crate::mixture_files::MixtureFiles;
 use crate::output::{TextTable, log_and_warn, print, print_stderr};
@@ -108,7 +108,8 @@ impl CalmBuildArgs {
         let Some(mixture) = build.run(projection, seed)? else { return Ok(stopped()) };
         let embed = self.embed.as_deref().map(|copy| (self.model.as_path(), copy));
         let files = MixtureFiles { embed, output: &self.output };
-        let Some(updates) = write_mixture(&mixture, files, &model.model, campaign.as_ref(), &stop)? else {
+        let Some(updates) = write_mixture(&mixture, files, &model.model.shared(), campaign.as_ref(), &stop)?
+        else {
             return Ok(stopped());
         };
         build.finish()?;
@@ -130,12 +131,12 @@ impl CalmBuildArgs {
 
     /// As [`projected`], with what the command line says about the projection.
     fn projected_model(&self) -> Result<(FeatureModel, Projection, Option<i64>), CommandError> {
-        let model = GraceModel::load(&self.model).map_err(CommandError::input)?;
+        let model = LoadedModel::load(&self.model)?;
         if let (Some(found), Some(_)) = (model.projection(), self.projection_dimension) {
             return Err(CommandError::Input(format!(
                 "--projection-dimension: {} has a projection with {} features; expected a model without one",
                 self.model.display(),
-                found.dimension
+                found.columns
             )));
         }
         let dimension = self.projection_dimension.map_or(PROJECTED, |dimension| dimension as usize);
@@ -157,7 +158,7 @@ impl CalmBuildArgs {
             candidates: self.candidates.clone(),
             shard_size: self.shard_size,
         };
-        let hash = file_hash::hash(&self.model).map_err(CommandError::input)?;
+        let hash = model.model.identity(&self.model)?;
         let context = PassContext {
             model: model.clone(),
             files,
@@ -193,7 +194,7 @@ pub(super) fn stopped() -> ExitStatus {
 pub(super) fn write_mixture(
     mixture: &BuiltMixture,
     files: MixtureFiles<'_>,
-    model: &Arc<GraceModel>,
+    model: &Arc<dyn ModelWithFeatures>,
     campaign: Option<&UpdateSource>,
     stop: &CancellationToken,
 ) -> Result<Option<String>, CommandError> {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use calm::build::{ArtifactVersion, BuiltMixture};
 use calm::{Artifact, Mixture};
-use potentials::grace::GraceModel;
+use potentials::ModelWithFeatures;
 use store::{Location, Store};
 use tokio_util::sync::CancellationToken;
 
@@ -41,7 +41,7 @@ impl UpdateSource {
         &self,
         mixture: &BuiltMixture,
         files: MixtureFiles<'_>,
-        model: &Arc<GraceModel>,
+        model: &Arc<dyn ModelWithFeatures>,
         stop: &CancellationToken,
     ) -> Result<Option<String>, CommandError> {
         let built = write_beside(mixture, files.output)?;
@@ -57,7 +57,7 @@ impl UpdateSource {
 
     async fn update(
         &self,
-        model: &Arc<GraceModel>,
+        model: &Arc<dyn ModelWithFeatures>,
         original: Mixture,
         stop: &CancellationToken,
     ) -> Result<Option<MixtureAfterUpdates>, CommandError> {

@@ -6,12 +6,12 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use analysis::{SystematicSample, quantile, spearman};
 use calm::{Artifact, Grades};
-use potentials::grace::GraceModel;
 use serde::Serialize;
 
 use crate::artifact_checks::load_artifact;
 use crate::cli::{CommandError, ExitStatus};
 use crate::features::FeatureCalculator;
+use crate::loaded_model::LoadedModel;
 use crate::output::{self, Bar, TextTable, decimals, print, print_json};
 use crate::structure_files::{FileLine, StructureArgs};
 
@@ -69,12 +69,12 @@ struct Comparison {
 
 impl CalmCompareArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
-        let model = GraceModel::load(&self.model).map_err(CommandError::input)?;
+        let model = LoadedModel::load(&self.model)?;
         let (model, first) = load_artifact(model, &self.first).map_err(CommandError::Input)?;
         let (model, second) = load_artifact(model, &self.second).map_err(CommandError::Input)?;
         let artifacts = [first, second];
         let symbols = artifacts[0].symbols.clone();
-        let gradings = self.grade(model, &artifacts)?;
+        let gradings = self.grade(&model, &artifacts)?;
         let found = symbols.iter().zip(&gradings).filter_map(|(symbol, grading)| grading.compare(symbol));
         let found: Vec<_> = found.collect();
         if self.json {
@@ -86,10 +86,10 @@ impl CalmCompareArgs {
     }
 
     /// The grades of all atoms, by element.
-    fn grade(&self, model: GraceModel, artifacts: &[Artifact; 2]) -> Result<Vec<Grading>, CommandError> {
-        let dimension = model.feature_dimension();
+    fn grade(&self, model: &LoadedModel, artifacts: &[Artifact; 2]) -> Result<Vec<Grading>, CommandError> {
+        let dimension = model.dimension();
         let mut gradings: Vec<_> = model.elements().iter().map(|_| Grading::new()).collect();
-        let mut calculator = FeatureCalculator::new(Arc::new(model));
+        let mut calculator = FeatureCalculator::new(model.shared());
         let files = self.data.files()?;
         let read = Arc::new(AtomicU64::new(0));
         let bar = Bar::new(Some(files.total_bytes()?), BAR);
@@ -99,7 +99,7 @@ impl CalmCompareArgs {
         while let Some((frame, file)) = structures.next()? {
             let position = FileLine { file: file.path, line: frame.line };
             let elements = calculator.compute(&frame.structure).map_err(|error| position.wrong(error))?;
-            let features = &calculator.grace.features()[..elements.len() * dimension];
+            let features = &calculator.potential.features()[..elements.len() * dimension];
             for (grades, artifact) in grades.iter_mut().zip(artifacts) {
                 grades
                     .evaluate(&artifact.mixture, &elements, features, None)

@@ -3,14 +3,13 @@
 use std::path::PathBuf;
 
 use calm::build::BuildSettings;
-use potentials::grace::GraceModel;
 
 use super::build::{report, stopped, write_mixture};
 use super::campaign_updates::UpdateSource;
 use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureVariant;
-use crate::file_hash;
+use crate::loaded_model::LoadedModel;
 use crate::mixture_build::{Merged, PartsMerge, projected};
 use crate::mixture_files::MixtureFiles;
 use crate::output::print;
@@ -46,17 +45,17 @@ impl CalmMergeArgs {
             AtomicFile::create(output)?;
         }
         let campaign = self.campaign.as_deref().map(UpdateSource::find).transpose()?;
-        let model = GraceModel::load(&self.model).map_err(CommandError::input)?;
-        let hash = file_hash::hash(&self.model).map_err(CommandError::input)?;
+        let model = LoadedModel::load(&self.model)?;
+        let hash = model.identity(&self.model)?;
         let mut merge = PartsMerge::open(&self.output, &hash)?;
         let BuildSettings { seed, dimension, .. } = *merge.settings();
         let norms = match self.feature_variant {
             Some(FeatureVariant::Linear | FeatureVariant::Hidden) => 0,
-            _ => 1 + model.description().architecture.layers(),
+            _ => model.basis().map_or(0, |(_, layers)| 1 + layers),
         };
         let dimension = dimension.saturating_sub(norms);
         let (model, projection, seed) = projected(&self.model, model, self.feature_variant, seed, dimension)?;
-        match merge.run(&model.model, projection, seed)? {
+        match merge.run(model.symbols(), projection, seed)? {
             Merged::Pass(pass) => {
                 print(|out| writeln!(out, "pass {pass} of 3 is merged; continue with --pass {}", pass + 1))?;
             }
@@ -64,7 +63,7 @@ impl CalmMergeArgs {
                 let embed = self.embed.as_deref().map(|copy| (self.model.as_path(), copy));
                 let files = MixtureFiles { embed, output: &self.output };
                 let updates =
-                    write_mixture(&mixture, files, &model.model, campaign.as_ref(), &stop_token()?)?;
+                    write_mixture(&mixture, files, &model.model.shared(), campaign.as_ref(), &stop_token()?)?;
                 let Some(updates) = updates else { return Ok(stopped()) };
                 merge.finish()?;
                 report(&mixture, &self.output, &updates)?;

@@ -9,7 +9,7 @@ use atoms::{Evaluation, Structure};
 use calm::baselines::{Baseline, BaselineError, BaselineFile};
 use calm::neighbourhood::PairError;
 use calm::{NeighbourWeights, neighbourhood_average};
-use potentials::grace::{GraceModel, PullBack};
+use potentials::grace::PullBack;
 
 use super::scorer::Scorer;
 use crate::calm_validation::labelled::ScoreColumn;
@@ -17,6 +17,7 @@ use crate::calm_validation::{AtomScore, BaselineScore, score_own_features};
 use crate::cli::CommandError;
 use crate::feature_variant::FeatureModel;
 use crate::features::{FeatureCalculator, FeatureError};
+use crate::loaded_model::LoadedModel;
 
 /// Baselines and models with their work arrays.
 pub struct OtherScores {
@@ -45,6 +46,8 @@ pub enum OtherScoreError {
     Features(#[from] FeatureError),
     #[error(transparent)]
     Baseline(#[from] BaselineError),
+    #[error("{0}")]
+    OwnFeatures(String),
     #[error(transparent)]
     Pair(#[from] PairError),
     #[error(transparent)]
@@ -79,8 +82,8 @@ impl OtherScores {
             files.push(found);
         }
         let load =
-            |path: &PathBuf| GraceModel::load(path).map(|model| FeatureCalculator::new(Arc::new(model)));
-        let ensemble = ensemble.iter().map(load).collect::<Result<_, _>>().map_err(CommandError::input)?;
+            |path: &PathBuf| LoadedModel::load(path).map(|model| FeatureCalculator::new(model.shared()));
+        let ensemble = ensemble.iter().map(load).collect::<Result<_, _>>()?;
         Ok(Self { files, ensemble, averages: Vec::new() })
     }
 
@@ -135,7 +138,8 @@ impl OtherScores {
             }
             for (name, baseline) in &file.baselines {
                 let found = match &mut file.calculator {
-                    Some(calculator) => score_own_features(baseline, calculator, &scorer.elements)?,
+                    Some(calculator) => score_own_features(baseline, calculator, &scorer.elements)
+                        .map_err(OtherScoreError::OwnFeatures)?,
                     None => baseline.score(&scorer.elements, scorer.features())?,
                 };
                 columns.push((name.clone(), found));
@@ -167,7 +171,7 @@ impl OtherScores {
         for model in &mut self.ensemble {
             model.compute(structure)?;
             let mut evaluation = Evaluation::default();
-            model.grace.backward(None, &mut evaluation, &mut PullBack::default());
+            model.backward(None, &mut evaluation, &mut PullBack::default()).map_err(FeatureError::from)?;
             forces.push(evaluation.forces);
         }
         Ok(force_deviation(&forces)?)

@@ -8,11 +8,11 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use atoms::extxyz::{Frame, write_frame};
 use atoms::{composition, element_symbol};
 use calm::weighted_sample::WeightedSampler;
-use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
+use crate::loaded_model::LoadedModel;
 use crate::mixture_build::{PROJECTED, projected};
 use crate::output::{Bar, TextTable, count, print, print_stderr};
 use crate::signals::stop_token;
@@ -113,7 +113,7 @@ impl CalmSampleArgs {
 
 impl SampledModel {
     fn load(path: &Path) -> Result<Self, CommandError> {
-        let model = GraceModel::load(path).map_err(CommandError::input)?;
+        let model = LoadedModel::load(path)?;
         let elements = model.elements().iter().map(|species| species.atomic_number()).collect();
         let (_, projection, _) = projected(path, model, None, 0, PROJECTED)?;
         Ok(Self { elements, dimension: projection.feature_dimension as u64 })

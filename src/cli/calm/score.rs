@@ -8,7 +8,6 @@ use atoms::FileError;
 use atoms::extxyz::{Column, ColumnData, ExtxyzValue, Frame, write_frame};
 use calm::{Artifact, NeighbourWeights};
 use npyz::{NpyWriter, WriterBuilder};
-use potentials::grace::GraceModel;
 
 use super::other_scores::OtherScores;
 use super::score_calibration::{self, ScoreCalibration};
@@ -18,6 +17,7 @@ use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureModel;
+use crate::loaded_model::LoadedModel;
 use crate::output::{self, Bar, print};
 use crate::xyz_reader::XyzReader;
 
@@ -190,7 +190,7 @@ pub(super) fn load_any(
         check_sound(&own, export).map_err(CommandError::Input)?;
         return Ok((model, own));
     };
-    let model = GraceModel::load(export).map_err(CommandError::input)?;
+    let model = LoadedModel::load(export)?;
     let artifact = Artifact::load(path).map_err(CommandError::input)?;
     let model = FeatureModel::for_artifact(export, model, &artifact.projection)?;
     let own = model.stored_projection().unwrap_or_else(|| artifact.projection.clone());

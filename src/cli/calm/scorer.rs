@@ -89,7 +89,9 @@ impl Scorer {
         self.elements = elements;
         self.gamma_nbr = neighbourhood_average(&self.grades.gamma, self.pairs.iter().copied())?;
         let cotangent = gradient.then_some(self.cotangent.as_slice());
-        self.features.backward(cotangent, &mut self.evaluation, &mut self.pull_back);
-        Ok(())
+        Ok(self
+            .features
+            .backward(cotangent, &mut self.evaluation, &mut self.pull_back)
+            .map_err(FeatureError::from)?)
     }
 }

@@ -8,7 +8,6 @@ use atoms::Species;
 use atoms::prototypes::Prototype;
 use calm::{Mixture, NeighbourWeights};
 use md::Fire;
-use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
 use super::other_scores::OtherScores;
@@ -22,6 +21,7 @@ use crate::calm_validation::{
 };
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureModel;
+use crate::loaded_model::LoadedModel;
 use crate::output::{self, Bar, TextTable, decimals, print, print_stderr};
 use crate::page::{create_directory, write_files};
 use crate::signals::stop_token;
@@ -218,21 +218,21 @@ impl CalmValidateArgs {
     }
 
     /// The spread of the energies, if there are further models.
-    fn ensemble(&self, model: &Arc<GraceModel>) -> Result<Option<Box<dyn AtomScore>>, CommandError> {
-        let mut models = vec![Arc::clone(model)];
+    fn ensemble(&self, model: &LoadedModel) -> Result<Option<Box<dyn AtomScore>>, CommandError> {
+        let mut models = vec![model.shared()];
         for path in &self.ensemble {
-            let other = GraceModel::load(path).map_err(CommandError::input)?;
+            let other = LoadedModel::load(path)?;
             if let Some(missing) = model.elements().iter().find(|species| !other.elements().contains(species))
             {
                 let message = format!("{}: does not support {missing}, as the model does", path.display());
                 return Err(CommandError::Input(message));
             }
-            models.push(Arc::new(other));
+            models.push(other.shared());
         }
         Ok((models.len() > 1).then(|| Box::new(EnergySpread::new(models)) as Box<dyn AtomScore>))
     }
 
-    fn settings(&self, model: &GraceModel) -> Result<ValidationSettings, CommandError> {
+    fn settings(&self, model: &LoadedModel) -> Result<ValidationSettings, CommandError> {
         let known = model.elements();
         let names = || known.iter().map(|species| species.symbol()).collect::<Vec<_>>().join(", ");
         for species in self.elements.iter().chain(self.pairs.iter().flatten()) {
@@ -258,7 +258,8 @@ impl CalmValidateArgs {
             scan_steps: self.scan_steps.get(),
             relaxation: (!self.no_relax).then(Fire::default),
             solution_structures: self.solution_structures.get(),
-            collision_evaluations: self.collision_evaluations,
+            // They need the readout of the model.
+            collision_evaluations: if model.grace().is_some() { self.collision_evaluations } else { 0 },
             seed: self.rng_seed,
         })
     }

@@ -3,10 +3,12 @@
 use std::fs;
 use std::io::{self, Cursor, Write};
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Instant;
 
 use calm::build::ArtifactVersion;
 use orchestrator::selector::CampaignMode;
+use potentials::ModelWithFeatures;
 use serde_json::json;
 use store::{
     CampaignLock, Fate, Location, Store, VersionFiles, VersionRecord, VersionState, unix_milliseconds,
@@ -167,7 +169,8 @@ async fn mixture(
     if !has_accepted(store, after).await? {
         return Ok(Some((read(path)?, Updates::default())));
     }
-    let (model, original) = (files.model_files()?.load()?, files.artifact()?);
+    let model: Arc<dyn ModelWithFeatures> = files.model_files()?.load()?;
+    let original = files.artifact()?;
     let covered = (1..=after).collect();
     let found =
         unlabelled_updates::apply_others(store, &model, original.mixture.clone(), &covered, stop).await?;

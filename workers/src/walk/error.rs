@@ -10,17 +10,47 @@ use crate::bias::UngradedError;
 #[derive(Debug, thiserror::Error)]
 pub(super) enum WalkError {
     #[error(transparent)]
-    Dynamics(#[from] DynamicsError),
+    Dynamics(DynamicsError),
     #[error(transparent)]
-    Potential(#[from] PotentialError),
+    Potential(PotentialError),
+    /// The program that evaluates the potential does not answer any more; the walk is not at fault.
+    #[error("{0}")]
+    Unavailable(String),
     #[error(transparent)]
     Structure(#[from] StructureError),
     #[error(transparent)]
-    Ungraded(#[from] UngradedError),
+    Ungraded(UngradedError),
     #[error(transparent)]
     Zbl(#[from] ZblRangeError),
     #[error("the walk's checkpoint cannot be read: {0}")]
     Checkpoint(#[from] postcard::Error),
     #[error("{0}")]
     Diverged(String),
+}
+
+impl From<PotentialError> for WalkError {
+    fn from(error: PotentialError) -> Self {
+        match error {
+            PotentialError::Unavailable(reason) => Self::Unavailable(reason),
+            other => Self::Potential(other),
+        }
+    }
+}
+
+impl From<DynamicsError> for WalkError {
+    fn from(error: DynamicsError) -> Self {
+        match error {
+            DynamicsError::Potential(PotentialError::Unavailable(reason)) => Self::Unavailable(reason),
+            other => Self::Dynamics(other),
+        }
+    }
+}
+
+impl From<UngradedError> for WalkError {
+    fn from(error: UngradedError) -> Self {
+        match error {
+            UngradedError::Potential(PotentialError::Unavailable(reason)) => Self::Unavailable(reason),
+            other => Self::Ungraded(other),
+        }
+    }
 }

@@ -112,7 +112,7 @@ pub(super) fn node(directory: &Path, prefix: &str) -> Result<Node<Service>, IpcE
         .map_err(|e| IpcError::new("begin", e))
 }
 
-fn name(text: &str) -> Result<ServiceName, IpcError> {
+pub(super) fn name(text: &str) -> Result<ServiceName, IpcError> {
     text.try_into().map_err(|e| IpcError::new("name a service", e))
 }
 
@@ -200,7 +200,7 @@ pub(super) fn open_walker_wakeup(
     open_wakeup(node, &walker_wakeup_name(sender))
 }
 
-fn create_wakeup(
+pub(super) fn create_wakeup(
     node: &Node<Service>,
     wakeup: &str,
     processes: usize,
@@ -225,7 +225,7 @@ fn create_wakeup(
     events.listener_builder().create().map_err(|e| IpcError::new("listen to events", e))
 }
 
-fn open_wakeup(node: &Node<Service>, wakeup: &str) -> Result<Notifier<Service>, IpcError> {
+pub(super) fn open_wakeup(node: &Node<Service>, wakeup: &str) -> Result<Notifier<Service>, IpcError> {
     let events = node.service_builder(&name(wakeup)?).event().open();
     let events = events.map_err(|e| IpcError::new("open the events", e))?;
     events.notifier_builder().create().map_err(|e| IpcError::new("open the events", e))

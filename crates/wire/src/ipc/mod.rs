@@ -14,6 +14,7 @@
 //!   of the same user: a process that writes to the mapped memory on purpose can do harm, as with a debugger.
 
 mod borrowed_request;
+mod calls;
 mod config;
 mod connections;
 mod reencode;
@@ -29,6 +30,7 @@ use serde::{Deserialize, Serialize};
 use crate::mixture::SharedMixtureError;
 use crate::protocol::message::SenderId;
 
+pub use calls::{CallAddress, CallClient, CallServer, IncomingCall, call_space_needed};
 pub use config::space_needed;
 pub use connections::Traffic;
 #[doc(hidden)]
@@ -93,7 +95,8 @@ pub enum IpcError {
 }
 
 impl IpcError {
-    fn new(what: &'static str, why: impl fmt::Display) -> Self {
+    /// An error of the transport: what could not be done, and why.
+    pub fn new(what: &'static str, why: impl fmt::Display) -> Self {
         Self::Transport { what, why: why.to_string() }
     }
 }

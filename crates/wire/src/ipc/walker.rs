@@ -226,7 +226,7 @@ impl Transport for IpcWalker {
 
 /// The same memory as initialized words.
 #[allow(unsafe_code)]
-fn initialised(memory: &mut [MaybeUninit<u64>]) -> &mut [u64] {
+pub(super) fn initialised(memory: &mut [MaybeUninit<u64>]) -> &mut [u64] {
     // SAFETY: the memory is a mapped file, so the kernel has initialized every byte, with zero or with what was written
     // there before.
     unsafe { &mut *(std::ptr::from_mut(memory) as *mut [u64]) }

@@ -1,0 +1,97 @@
+//! A file in shared memory, through which numbers go to the server and back.
+
+use std::fs::{File, OpenOptions};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use memmap2::MmapMut;
+use rustix::fs::{FallocateFlags, fallocate};
+
+/// The smallest arena, bytes.
+const SMALLEST: usize = 1 << 20;
+
+/// A file that grows. The server maps it again when its path has changed.
+#[derive(Debug)]
+pub(crate) struct Arena {
+    directory: PathBuf,
+    number: usize,
+    path: PathBuf,
+    /// Whether the file still has its name.
+    is_named: bool,
+    map: Option<MmapMut>,
+}
+
+impl Arena {
+    /// An arena without memory, in a directory of shared memory.
+    pub fn new(directory: &Path, number: usize) -> Self {
+        Self { directory: directory.to_owned(), number, path: PathBuf::new(), is_named: false, map: None }
+    }
+
+    /// Makes room for so many bytes. Returns whether the contents are lost.
+    ///
+    /// # Errors
+    /// Errors of the operating system, such as shared memory that is full.
+    pub fn reserve(&mut self, bytes: usize) -> io::Result<bool> {
+        if self.map.as_ref().is_some_and(|map| map.len() >= bytes) {
+            return Ok(false);
+        }
+        self.remove();
+        self.path = self.directory.join(unique_name(self.number));
+        let size = bytes.next_power_of_two().max(SMALLEST);
+        let file = OpenOptions::new().read(true).write(true).create_new(true).open(&self.path)?;
+        self.is_named = true;
+        // Without memory behind it, a write would kill the process.
+        let map = fallocate(&file, FallocateFlags::empty(), 0, size as u64)
+            .map_err(io::Error::from)
+            .and_then(|()| map(&file));
+        self.map = Some(map.inspect_err(|_| self.unlink())?);
+        Ok(true)
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Size of the file, bytes.
+    pub fn len(&self) -> usize {
+        self.map.as_ref().map_or(0, |map| map.len())
+    }
+
+    /// The memory.
+    pub fn bytes(&mut self) -> &mut [u8] {
+        self.map.as_deref_mut().unwrap_or_default()
+    }
+
+    /// Removes the name of the file. Who has mapped it keeps it.
+    pub fn unlink(&mut self) {
+        if std::mem::take(&mut self.is_named) {
+            let _ = std::fs::remove_file(&self.path);
+        }
+    }
+
+    fn remove(&mut self) {
+        self.map = None;
+        self.unlink();
+    }
+}
+
+impl Drop for Arena {
+    fn drop(&mut self) {
+        self.remove();
+    }
+}
+
+/// No other arena of this host has this name.
+fn unique_name(number: usize) -> String {
+    use std::sync::atomic::{AtomicU32, Ordering};
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    format!("calmwalk-{}-{}-arena-{number}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed))
+}
+
+#[allow(unsafe_code)]
+fn map(file: &File) -> io::Result<MmapMut> {
+    // SAFETY: the file is new and has its full size. Only the server that this program started maps it too, and it writes only while
+    // this program waits for its answer; whatever it writes, all of it are numbers of which any bits are valid.
+    unsafe { MmapMut::map_mut(file) }
+}

@@ -1,0 +1,295 @@
+//! A server and its arenas: one batch after the other, with deadlines.
+
+use std::collections::HashSet;
+use std::path::Path;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
+use std::time::{Duration, Instant};
+
+use potentials::grace::Precision;
+use serde_json::json;
+use tokio_util::sync::CancellationToken;
+
+use crate::batch::{BatchArena, BatchKind};
+use crate::call::Geometry;
+use crate::description::{FeatureForm, ModelDescription, PROTOCOL};
+use crate::faults::{Fault, Reply};
+use crate::process::{ServerEvent, ServerProcess};
+use crate::self_test::{Evaluate, TestResult};
+use crate::settings::PythonSettings;
+use crate::shapes::Shape;
+use crate::worker::Event;
+
+/// Interval at which a synchronous call looks whether the device was asked to stop.
+const LOOK_AROUND: Duration = Duration::from_millis(200);
+
+/// A call that the server has not answered yet.
+#[derive(Clone, Debug)]
+pub(crate) struct Outstanding {
+    pub id: u64,
+    pub kind: BatchKind,
+    pub slot: usize,
+    pub sent: Instant,
+    pub deadline: Instant,
+}
+
+/// A started server that has said hello.
+pub(crate) struct Server {
+    process: ServerProcess,
+    generation: u64,
+    pub description: ModelDescription,
+    pub arenas: [BatchArena; 2],
+    /// Shapes that were evaluated or pulled back since the start: later calls of them are quick.
+    known_shapes: HashSet<(Shape, bool)>,
+    next_id: u64,
+    /// Id of the last evaluation in each arena.
+    evaluations: [Option<u64>; 2],
+}
+
+/// What is needed to start servers.
+pub(crate) struct ServerSetup<'a> {
+    pub settings: &'a PythonSettings,
+    /// Where the package is.
+    pub package: &'a Path,
+    /// Where arenas are made.
+    pub memory: &'a Path,
+    pub events: &'a Sender<Event>,
+    pub stop: &'a CancellationToken,
+}
+
+impl Server {
+    /// Starts a server and says hello. Events of earlier servers are dropped; calls that come meanwhile go to `early`.
+    ///
+    /// # Errors
+    /// Why there is none.
+    pub fn start(
+        setup: &ServerSetup<'_>,
+        generation: u64,
+        incoming: &Receiver<Event>,
+        early: &mut Vec<Event>,
+    ) -> Result<Self, Fault> {
+        let settings = setup.settings;
+        let tag = move |event| Event::Server { generation, event };
+        let mut process = ServerProcess::start(settings, setup.package, setup.events.clone(), tag)
+            .map_err(Fault::Exited)?;
+        let precision = match settings.precision {
+            Precision::Double => "double",
+            Precision::Mixed => "single",
+        };
+        let hello = json!({
+            "call": "hello", "protocol": PROTOCOL, "adapter": settings.adapter, "model": settings.model, "options": settings.options,
+            "device": settings.device.0, "precision": precision, "threads": settings.threads, "cache": settings.cache,
+        });
+        let sent = process.send(&hello.to_string());
+        let deadline = Instant::now() + settings.compile_timeout;
+        let wait = Wait { setup, generation, incoming, early };
+        let line = sent
+            .map_err(|error| Fault::Exited(format!("{}: {error}", settings.names())))
+            .and_then(|()| wait.line(deadline, "hello"));
+        let description = line.and_then(|line| {
+            Reply::read(&line, None, &settings.names())?;
+            let nonsense = |error: String| Fault::Reported(format!("{}, hello: {error}", settings.names()));
+            let description: ModelDescription =
+                serde_json::from_str(&line).map_err(|error| nonsense(error.to_string()))?;
+            description.check().map_err(nonsense)?;
+            Ok(description)
+        });
+        match description {
+            Ok(description) => {
+                let dimension = match description.features.form {
+                    FeatureForm::None => 0,
+                    _ => description.features.dimension,
+                };
+                let arenas = [0, 1].map(|number| BatchArena::new(setup.memory, number, dimension));
+                let (known_shapes, evaluations) = (HashSet::new(), [None; 2]);
+                Ok(Self { process, generation, description, arenas, known_shapes, next_id: 1, evaluations })
+            }
+            Err(fault) => Err(with_end(fault, process)),
+        }
+    }
+
+    /// Whether an event is this server's.
+    pub fn is_of(&self, generation: u64) -> bool {
+        self.generation == generation
+    }
+
+    /// Its process.
+    pub fn pid(&self) -> u32 {
+        self.process.pid()
+    }
+
+    /// Ends it. A fault that says nothing of the process gets its last words.
+    pub fn end(self, fault: Fault) -> Fault {
+        with_end(fault, self.process)
+    }
+
+    /// Writes structures into a slot's arena.
+    ///
+    /// # Errors
+    /// Shared memory that is full.
+    pub fn write(&mut self, slot: usize, structures: &[&Geometry]) -> Result<(), Fault> {
+        let (padding, cutoff) = (self.description.padding, self.description.cutoff());
+        self.evaluations[slot] = None;
+        let written = self.arenas[slot].write(structures, padding, cutoff);
+        written.map_err(|error| Fault::Memory(format!("shared memory for a batch: {error}")))
+    }
+
+    /// Sends the batch of a slot.
+    ///
+    /// # Errors
+    /// The server has exited.
+    pub fn send(
+        &mut self,
+        slot: usize,
+        evaluates: Option<bool>,
+        settings: &PythonSettings,
+    ) -> Result<Outstanding, Fault> {
+        let id = self.next_id;
+        self.next_id += 1;
+        let kind = match evaluates {
+            Some(features) => BatchKind::Evaluate { features },
+            None => BatchKind::PullBack { kept: self.evaluations[slot] },
+        };
+        self.evaluations[slot] = evaluates.is_some().then_some(id);
+        let arena = &self.arenas[slot];
+        let is_known = self.known_shapes.contains(&(arena.shape(), evaluates.is_some()));
+        let timeout = if is_known { settings.timeout } else { settings.compile_timeout };
+        let message = arena.message(id, kind);
+        let sent = self.process.send(&message);
+        sent.map_err(|error| Fault::Exited(format!("{}: {error}", settings.names())))?;
+        let now = Instant::now();
+        Ok(Outstanding { id, kind, slot, sent: now, deadline: now + timeout })
+    }
+
+    /// Takes in the answer to the oldest call. Returns whether the shape was new.
+    ///
+    /// # Errors
+    /// What the server reports, or that the line is no answer.
+    pub fn answer(&mut self, line: &str, call: &Outstanding, names: &str) -> Result<bool, Fault> {
+        let reply = Reply::read(line, Some(call.id), names)?;
+        let evaluates = matches!(call.kind, BatchKind::Evaluate { .. });
+        self.arenas[call.slot].unlink();
+        let is_new = self.known_shapes.insert((self.arenas[call.slot].shape(), evaluates));
+        Ok(reply.compiled || (is_new && self.description.padding))
+    }
+}
+
+/// The fault with how the process ended.
+fn with_end(fault: Fault, process: ServerProcess) -> Fault {
+    let ended = process.end();
+    match fault {
+        Fault::Exited(message) => Fault::Exited(format!("{message}; the server ended: {ended}")),
+        Fault::Timeout(message) => Fault::Timeout(format!("{message}; the server: {ended}")),
+        other => other,
+    }
+}
+
+/// Waits for a line of a server, and keeps other events.
+pub(crate) struct Wait<'a> {
+    pub setup: &'a ServerSetup<'a>,
+    pub generation: u64,
+    pub incoming: &'a Receiver<Event>,
+    pub early: &'a mut Vec<Event>,
+}
+
+impl Wait<'_> {
+    /// The next line.
+    ///
+    /// # Errors
+    /// None has come in time, the server has exited, or the device was asked to stop.
+    pub fn line(self, deadline: Instant, call: &str) -> Result<String, Fault> {
+        let names = self.setup.settings.names();
+        loop {
+            if self.setup.stop.is_cancelled() {
+                return Err(Fault::Stopped);
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Err(Fault::Timeout(format!("{names}, {call}: no answer in time")));
+            }
+            match self.incoming.recv_timeout(left.min(LOOK_AROUND)) {
+                Ok(Event::Server { generation, event }) if generation == self.generation => match event {
+                    ServerEvent::Line(line) => return Ok(line),
+                    ServerEvent::Ended => {
+                        return Err(Fault::Exited(format!("{names}, {call}: no answer")));
+                    }
+                },
+                Ok(Event::Server { .. }) | Err(RecvTimeoutError::Timeout) => {}
+                Ok(other) => self.early.push(other),
+                Err(RecvTimeoutError::Disconnected) => return Err(Fault::Stopped),
+            }
+        }
+    }
+}
+
+/// Synchronous calls, for the self-test and to warm up.
+pub(crate) struct Synchronous<'a> {
+    pub server: &'a mut Server,
+    pub setup: &'a ServerSetup<'a>,
+    pub incoming: &'a Receiver<Event>,
+    pub early: &'a mut Vec<Event>,
+    /// The last fault, as the test knows messages only.
+    pub fault: Option<Fault>,
+}
+
+impl Synchronous<'_> {
+    /// Sends the batch in the first arena and waits.
+    ///
+    /// # Errors
+    /// Faults of the server.
+    pub fn round_trip(
+        &mut self,
+        structures: &[&Geometry],
+        cotangents: Option<&[&[f64]]>,
+    ) -> Result<Vec<TestResult>, Fault> {
+        let settings = self.setup.settings;
+        self.server.write(0, structures)?;
+        if let Some(cotangents) = cotangents {
+            self.server.arenas[0].write_cotangents(cotangents.iter().map(|one| Some(*one)));
+        }
+        let has_features = self.server.description.features.form != FeatureForm::None;
+        let evaluates = cotangents.is_none().then_some(has_features);
+        let call = self.server.send(0, evaluates, settings)?;
+        let generation = self.server.generation;
+        let wait = Wait { setup: self.setup, generation, incoming: self.incoming, early: self.early };
+        let what = if evaluates.is_some() { "evaluate" } else { "pull_back" };
+        let line = wait.line(call.deadline, what)?;
+        self.server.answer(&line, &call, &settings.names())?;
+        let results = (0..structures.len()).map(|k| {
+            let parts = self.server.arenas[0].result(k, call.kind);
+            match parts.not_finite() {
+                Some(what) => Err(Fault::Reported(format!("{}, {what}", settings.names()))),
+                None => Ok(TestResult {
+                    energies: parts.energies.to_vec(),
+                    vectors: parts.vectors.to_vec(),
+                    virial: parts.virial.to_vec(),
+                    features: parts.features.to_vec(),
+                }),
+            }
+        });
+        results.collect()
+    }
+
+    fn keep_fault<T>(&mut self, result: Result<T, Fault>) -> Result<T, String> {
+        result.map_err(|fault| {
+            let message = fault.message().to_owned();
+            self.fault = Some(fault);
+            message
+        })
+    }
+}
+
+impl Evaluate for Synchronous<'_> {
+    fn evaluate(&mut self, structures: &[&Geometry]) -> Result<Vec<TestResult>, String> {
+        let result = self.round_trip(structures, None);
+        self.keep_fault(result)
+    }
+
+    fn pull_back(
+        &mut self,
+        structures: &[&Geometry],
+        cotangents: &[&[f64]],
+    ) -> Result<Vec<TestResult>, String> {
+        let result = self.round_trip(structures, Some(cotangents));
+        self.keep_fault(result)
+    }
+}

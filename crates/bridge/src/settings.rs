@@ -1,0 +1,80 @@
+//! How the server of a model is started.
+
+use std::num::NonZeroU32;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use potentials::grace::Precision;
+use serde::{Deserialize, Serialize};
+
+/// Everything that the server of a model needs.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PythonSettings {
+    /// Directory of a virtual environment or of a conda environment (with `bin/python`), or a Python program.
+    pub environment: PathBuf,
+    /// Words before the Python program, for instance `apptainer exec image.sif`.
+    pub launcher: Vec<String>,
+    /// An adapter of the package, or one of the user: `module:Class` or `file.py:Class`.
+    pub adapter: String,
+    /// The model's file or directory, for the adapter.
+    pub model: Option<PathBuf>,
+    /// Further settings of the adapter.
+    pub options: serde_json::Map<String, serde_json::Value>,
+    /// Where the model is evaluated.
+    pub device: PythonDevice,
+    /// Precision of the model.
+    pub precision: Precision,
+    /// Processor threads of the server.
+    pub threads: NonZeroU32,
+    /// Largest number of structures of a batch.
+    pub max_batch: NonZeroU32,
+    /// Time for a call.
+    pub timeout: Duration,
+    /// Time for a call of a new shape, and for the start: frameworks compile.
+    pub compile_timeout: Duration,
+    /// Directory in which frameworks keep compiled programs.
+    pub cache: Option<PathBuf>,
+}
+
+/// The device on which a model is evaluated.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct PythonDevice(pub String);
+
+impl Default for PythonDevice {
+    fn default() -> Self {
+        Self("cpu".to_owned())
+    }
+}
+
+impl PythonSettings {
+    /// The usual settings of an adapter.
+    pub fn new(environment: &Path, adapter: &str, model: Option<&Path>) -> Self {
+        Self {
+            environment: environment.to_owned(),
+            launcher: Vec::new(),
+            adapter: adapter.to_owned(),
+            model: model.map(Path::to_owned),
+            options: serde_json::Map::new(),
+            device: PythonDevice::default(),
+            precision: Precision::default(),
+            threads: NonZeroU32::MIN,
+            max_batch: NonZeroU32::new(32).unwrap_or(NonZeroU32::MIN),
+            timeout: Duration::from_secs(60),
+            compile_timeout: Duration::from_secs(600),
+            cache: None,
+        }
+    }
+
+    /// The Python program.
+    pub(crate) fn program(&self) -> PathBuf {
+        let inside = self.environment.join("bin/python");
+        if self.environment.is_dir() || inside.exists() { inside } else { self.environment.clone() }
+    }
+
+    /// Names adapter and environment, for errors.
+    pub(crate) fn names(&self) -> String {
+        format!("adapter {} in {}", self.adapter, self.environment.display())
+    }
+}

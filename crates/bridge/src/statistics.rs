@@ -1,0 +1,53 @@
+//! What a device has done.
+
+use serde::{Deserialize, Serialize};
+
+/// Sums since the start.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct DeviceStatistics {
+    /// Batches that were answered.
+    pub batches: u64,
+    /// Structures in them, without padding.
+    pub structures: u64,
+    /// Directed bonds in them, without padding.
+    pub bonds: u64,
+    /// Time for which the server had at least one batch, s.
+    pub busy: f64,
+    /// Time for which calls waited until their batch was sent, s.
+    pub waited: f64,
+    /// Time of batches of a shape that was new, s: frameworks compile for it.
+    pub compiled: f64,
+    /// Time since the start, s.
+    pub elapsed: f64,
+    /// Starts of the server after the first one.
+    pub restarts: u64,
+    /// Largest batch, structures.
+    pub largest_batch: u64,
+    /// Bonds to which batches of several structures are limited, because the memory of the device was short.
+    pub max_bonds: Option<u64>,
+    /// The last failure.
+    pub last_failure: Option<String>,
+}
+
+impl DeviceStatistics {
+    /// Share of the time for which the server had work.
+    pub fn busy_share(&self) -> f64 {
+        if self.elapsed > 0.0 { self.busy / self.elapsed } else { 0.0 }
+    }
+
+    /// Mean number of structures of a batch.
+    pub fn mean_batch(&self) -> f64 {
+        if self.batches > 0 { self.structures as f64 / self.batches as f64 } else { 0.0 }
+    }
+
+    /// Directed bonds a second of the server's work.
+    pub fn bonds_per_second(&self) -> f64 {
+        if self.busy > 0.0 { self.bonds as f64 / self.busy } else { 0.0 }
+    }
+
+    /// Mean time for which a call waited until its batch was sent, s.
+    pub fn mean_wait(&self) -> f64 {
+        if self.structures > 0 { self.waited / self.structures as f64 } else { 0.0 }
+    }
+}

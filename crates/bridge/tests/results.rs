@@ -1,0 +1,112 @@
+//! Results of devices.
+
+use std::sync::Arc;
+
+use atoms::{Evaluation, NeighbourList};
+use bridge::{DeviceService, PythonModel};
+use calm::build::random_projection;
+use potentials::grace::{PullBack, Threads};
+use potentials::{ModelWithFeatures, PotentialWithFeatures};
+use serde_json::json;
+use tokio_util::sync::CancellationToken;
+use wire::shm_dir::ShmDir;
+
+use crate::common::{Fixture, crystal};
+
+/// Everything that a biased step gives.
+pub fn biased_step(
+    potential: &mut dyn PotentialWithFeatures,
+    repeats: usize,
+    seed: usize,
+) -> (Evaluation, PullBack, Vec<f64>) {
+    let structure = crystal(repeats, seed);
+    let mut list = NeighbourList::new(potential.cutoff(), 0.5);
+    list.update(&structure).unwrap();
+    let (mut energy, mut pull_back) = (Evaluation::default(), PullBack::default());
+    let grade = |_: &[u32], features: &[f64], out: &mut [f64]| {
+        out.iter_mut().zip(features).for_each(|(out, z)| *out = (3.0 * z).cos());
+    };
+    potential.evaluate_graded(&structure, &list, &grade, &mut energy, Some(&mut pull_back)).unwrap();
+    (energy, pull_back, potential.features().to_vec())
+}
+
+#[test]
+fn gradients_of_graded_features_are_derivatives() {
+    let fixture = Fixture::new(json!({}));
+    let device = fixture.device().unwrap();
+    assert!(device.info().self_test.is_deterministic && device.info().self_test.is_batch_independent);
+    let mut potential = Fixture::model(&device).evaluator(Threads::default());
+    let (_, pull_back, _) = biased_step(&mut *potential, 2, 0);
+    let structure = crystal(2, 0);
+    let mut sum = |step: f64| {
+        let mut moved = structure.clone();
+        moved.positions[3][1] += step;
+        let mut list = NeighbourList::new(potential.cutoff(), 0.5);
+        list.update(&moved).unwrap();
+        potential.forward(&moved, &list).unwrap();
+        potential.features().iter().map(|z| (3.0 * z).sin() / 3.0).sum::<f64>()
+    };
+    let expected = (sum(1e-4) - sum(-1e-4)) / 2e-4;
+    assert!((pull_back.gradient[3][1] - expected).abs() < 1e-7, "{} {expected}", pull_back.gradient[3][1]);
+}
+
+/// Walkers of any number get what each gets alone.
+#[test]
+fn batches_change_nothing() {
+    let fixture = Fixture::new(json!({ "base_seconds": 0.005 }));
+    let device = fixture.device().unwrap();
+    let model = Fixture::model(&device);
+    let alone: Vec<_> = (0..12)
+        .map(|k| biased_step(&mut *Arc::clone(&model).evaluator(Threads::default()), 1 + k % 2, k))
+        .collect();
+    std::thread::scope(|scope| {
+        for (k, alone) in alone.iter().enumerate() {
+            let mut potential = Arc::clone(&model).evaluator(Threads::default());
+            scope.spawn(move || {
+                for _ in 0..5 {
+                    assert!(biased_step(&mut *potential, 1 + k % 2, k) == *alone);
+                }
+            });
+        }
+    });
+    assert!(device.statistics().largest_batch > 1);
+}
+
+/// Padding and compiled programs.
+#[test]
+fn padding_changes_nothing() {
+    let plain = Fixture::new(json!({})).device().unwrap();
+    let padded = Fixture::new(json!({ "padding": true })).device().unwrap();
+    let step = |device| biased_step(&mut *Fixture::model(device).evaluator(Threads::default()), 2, 1);
+    assert!(step(&plain) == step(&padded));
+}
+
+/// Through shared memory the bits are those of the same process.
+#[test]
+fn shared_memory_changes_nothing() {
+    let fixture = Fixture::new(json!({}));
+    let device = fixture.device().unwrap();
+    let place = ShmDir::for_campaign(fixture.directory.path()).unwrap();
+    let _prepared = place.prepare(1 << 24).unwrap();
+    // Messages grow beyond what was expected.
+    let service = DeviceService::open(&device, &place, 7, 4, 64).unwrap();
+    let address = service.address().clone();
+    let model =
+        PythonModel::shared(device.info().description.clone(), address, CancellationToken::new()).unwrap();
+    let model = Arc::new(model.projected(random_projection(1, 8, 5, 2)).unwrap());
+    std::thread::scope(|scope| {
+        for k in 0..4 {
+            let (local, shared) = (Fixture::model(&device), Arc::clone(&model));
+            scope.spawn(move || {
+                let mut local = local.evaluator(Threads::default());
+                let mut shared = shared.evaluator(Threads::default());
+                for round in 0..4 {
+                    let seed = k + round / 2;
+                    assert!(biased_step(&mut *local, 2, seed) == biased_step(&mut *shared, 2, seed));
+                }
+            });
+        }
+    });
+    drop(service);
+    place.remove().unwrap();
+}

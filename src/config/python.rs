@@ -1,0 +1,79 @@
+//! `[potential.python]`: a model that its own framework evaluates.
+
+use std::num::NonZeroU32;
+use std::path::{Path, PathBuf};
+
+use bridge::{PythonDevice, PythonSettings};
+use potentials::grace::Precision;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::defaults;
+use crate::duration::Duration;
+
+/// `[potential.python]`
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct PythonSection {
+    /// Directory of the virtual or conda environment with the model's framework, or a Python program.
+    pub environment: PathBuf,
+    /// Words before the Python program, for instance `["apptainer", "exec", "mace.sif"]`. Default: none.
+    #[serde(default)]
+    pub launcher: Vec<String>,
+    /// Adapter that evaluates the model: `gracemaker`, `mace`, `ase`, or your own as `file.py:Class` or `module:Class`.
+    pub adapter: String,
+    /// Settings of the adapter (see docs/python-adapters.md). Default: none.
+    #[serde(default)]
+    #[schemars(with = "std::collections::BTreeMap<String, serde_json::Value>")]
+    pub options: serde_json::Map<String, serde_json::Value>,
+    /// Device that evaluates the model: `cpu`, `cuda`, `cuda:1`, ….
+    #[serde(default = "defaults::python_device")]
+    pub device: String,
+    /// Number of processor threads of the program.
+    #[serde(default = "defaults::repeats")]
+    pub threads: NonZeroU32,
+    /// Largest number of structures that the device evaluates at once. If its memory is too small for that, it evaluates fewer.
+    #[serde(default = "defaults::max_batch")]
+    pub max_batch: NonZeroU32,
+    /// Time after which a call that has no answer counts as failed: the program is started again.
+    #[serde(default = "defaults::python_timeout")]
+    pub timeout: Duration,
+    /// The same for the start, and for the first calls of each size, for which frameworks compile.
+    #[serde(default = "defaults::compile_timeout")]
+    pub compile_timeout: Duration,
+    /// Directory in which frameworks keep compiled programs for the next start. Default: none.
+    #[serde(default)]
+    pub cache: Option<PathBuf>,
+}
+
+impl PythonSection {
+    /// The program, for this model.
+    pub fn settings(&self, model: &Path, precision: Precision) -> PythonSettings {
+        let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+        PythonSettings {
+            environment: absolute(&self.environment),
+            launcher: self.launcher.clone(),
+            adapter: self.adapter.clone(),
+            model: Some(absolute(model)),
+            options: self.options.clone(),
+            device: PythonDevice(self.device.clone()),
+            precision,
+            threads: self.threads,
+            max_batch: self.max_batch,
+            timeout: self.timeout.get(),
+            compile_timeout: self.compile_timeout.get(),
+            cache: self.cache.as_deref().map(absolute),
+        }
+    }
+
+    /// Resolves paths relative to the directory of the configuration.
+    pub(super) fn resolve_paths(&mut self, directory: &Path) {
+        self.environment = directory.join(&self.environment);
+        if let Some(cache) = &mut self.cache {
+            *cache = directory.join(&*cache);
+        }
+        if let Some((file, class)) = self.adapter.rsplit_once(':').filter(|(file, _)| file.ends_with(".py")) {
+            self.adapter = format!("{}:{class}", directory.join(file).display());
+        }
+    }
+}
