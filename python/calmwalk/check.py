@@ -10,7 +10,7 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Callable, Optional
+from typing import Any, Callable, Optional
 
 import numpy as np
 
@@ -57,7 +57,9 @@ class Check:
         batch = self._batch()
         forces = self.adapter.evaluate(batch, False).forces
         largest = np.abs(forces).max()
-        return max(_error(forces[at], -self._slope(self._energy, self._moved(*at)), largest) for at in self._coordinates())
+        return max(
+            _error(forces[at], -self._slope(self._energy, self._moved(*at)), largest) for at in self._coordinates()
+        )
 
     def virials(self) -> float:
         """Virials against central differences of the energy by strain."""
@@ -96,7 +98,7 @@ class Check:
 
     def batch(self) -> float:
         """One batch of all structures against one batch for each."""
-        singles = [self.adapter.evaluate(self._batch([s]), self._has_features()) for s in self.structures]
+        singles = [self._evaluate([structure]) for structure in self.structures]
         return self._difference(self._evaluate(self.structures), _joined(singles))
 
     def permutation(self) -> float:
@@ -239,7 +241,7 @@ def _joined(results: list[Evaluation]) -> Evaluation:
     )
 
 
-def _error(one: np.ndarray, other: np.ndarray, scale: Optional[float] = None) -> float:
+def _error(one: Any, other: Any, scale: Optional[float] = None) -> float:
     one, other = np.asarray(one, dtype=float), np.asarray(other, dtype=float)
     if one.size == 0:
         return 0.0
@@ -249,7 +251,9 @@ def _error(one: np.ndarray, other: np.ndarray, scale: Optional[float] = None) ->
 
 def main() -> int:
     """Prints the checks of an adapter; 1 if one is not passed."""
-    parser = argparse.ArgumentParser(prog="python -m calmwalk.check", description="Checks an adapter on small structures.")
+    parser = argparse.ArgumentParser(
+        prog="python -m calmwalk.check", description="Checks an adapter on small structures."
+    )
     parser.add_argument("adapter", help="a built-in adapter, 'module:ClassName' or '/path/file.py:ClassName'")
     parser.add_argument("model", nargs="?", type=Path)
     parser.add_argument("--options", type=json.loads, default={}, help="options of the adapter, JSON")

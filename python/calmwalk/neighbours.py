@@ -73,7 +73,9 @@ def batch_of(structures: Sequence[Structure], cutoff: float, spare: tuple[int, i
         structure_of_atom=padded([np.repeat(which, atoms)], more_atoms, last_structure, np.int32),
         centres=padded([i + start for (i, _, _), start in zip(bonds, starts)], more_bonds, last_atom, np.int32),
         neighbours=padded([j + start for (_, j, _), start in zip(bonds, starts)], more_bonds, last_atom, np.int32),
-        structure_of_bond=padded([np.repeat(which, [len(v) for _, _, v in bonds])], more_bonds, last_structure, np.int32),
+        structure_of_bond=padded(
+            [np.repeat(which, [len(v) for _, _, v in bonds])], more_bonds, last_structure, np.int32
+        ),
         bonds=vectors,
         positions=padded([s.positions for s in structures], more_atoms, 0.0, np.float64),
         cells=padded([s.cell[None] for s in structures], more_structures, 0.0, np.float64),
