@@ -15,7 +15,7 @@ from typing import Any, Callable, Optional
 import numpy as np
 
 from .adapter import Adapter, Evaluation
-from .batch import Batch
+from .batch import Batch, Counts
 from .loading import find_adapter
 from .neighbours import Structure, batch_of
 
@@ -35,7 +35,8 @@ class Check:
         self._random = np.random.default_rng(seed)
         self._skin = float(np.max(adapter.info.cutoffs)) + 0.5
         self.structures = [self._cluster(distance, 9), self._crystal(distance), self._cluster(distance, 2)]
-        self.cotangents: Optional[np.ndarray] = None
+        largest = batch_of(self.structures, self._skin + 0.5).real
+        self._room = Counts(largest.structures + 1, largest.atoms + 1, largest.bonds)
 
     def all(self) -> dict[str, float]:
         """Relative error of each check, by name."""
@@ -118,24 +119,29 @@ class Check:
     def padding(self) -> float:
         """A batch with spare structures, atoms and bonds against one without."""
         cutoff = self._skin
-        padded = self.adapter.evaluate(batch_of(self.structures, cutoff, (1, 3, 17)), self._has_features())
+        spare = (1, 3, 17)
+        padded = self.adapter.evaluate(batch_of(self.structures, cutoff, spare), self._has_features())
         padded.energies, padded.forces, padded.virials = padded.energies[:-3], padded.forces[:-3], padded.virials[:-1]
         padded.features = None if padded.features is None else padded.features[:-3]
         return self._difference(self._evaluate(self.structures), padded)
 
     def beyond_cutoff(self) -> float:
         """A list with a skin against one up to the cutoff."""
-        short = batch_of(self.structures, self._skin - 0.5 + 1e-9, self._spare())
-        return self._difference(self._evaluate(self.structures), self.adapter.evaluate(short, self._has_features()))
+        short = self.adapter.evaluate(self._batch(cutoff=self._skin - 0.5 + 1e-9), self._has_features())
+        return self._difference(self._evaluate(self.structures), short)
 
     def _has_features(self) -> bool:
         return self.info.features.form != "none"
 
-    def _spare(self) -> tuple[int, int, int]:
-        return (1, 1, 1) if self.info.padding else (0, 0, 0)
-
-    def _batch(self, structures: Optional[list[Structure]] = None) -> Batch:
-        return batch_of(self.structures if structures is None else structures, self._skin, self._spare())
+    def _batch(self, structures: Optional[list[Structure]] = None, cutoff: Optional[float] = None) -> Batch:
+        """With padding, all batches have one shape."""
+        structures, cutoff = self.structures if structures is None else structures, cutoff or self._skin
+        batch, room = batch_of(structures, cutoff), self._room
+        if not self.info.padding:
+            return batch
+        real = batch.real
+        spare = (room.structures - real.structures, room.atoms - real.atoms, room.bonds - real.bonds)
+        return batch_of(structures, cutoff, spare)
 
     def _evaluate(self, structures: list[Structure]) -> Evaluation:
         """Without the spare rows."""

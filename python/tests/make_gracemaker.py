@@ -9,11 +9,13 @@ WORK receives model.yaml, checkpoint.index and checkpoint.data-…, gmm_artifact
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 os.environ.update({name: "1" for name in ("OMP_NUM_THREADS", "TF_NUM_INTRAOP_THREADS", "TF_NUM_INTEROP_THREADS")})
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -29,15 +31,12 @@ from calmwalk.neighbours import Structure, batch_of  # noqa: E402
 
 ELEMENTS = ["Al", "Cu"]
 CUTOFF = 4.5
-KINDS = {
-    "one": (
-        "GRACE_1LAYER_latest",
-        "{lmax: 2, n_rad_max: 5, prod_func_n_max: 6, max_order: 4, n_mlp_dens: 4, n_rad_base: 4, embedding_size: 8}",
-    ),
+SMALL = {"max_order": 4, "n_mlp_dens": 4, "n_rad_base": 4, "embedding_size": 8}
+KINDS: dict[str, tuple[str, dict[str, Any]]] = {
+    "one": ("GRACE_1LAYER_latest", {"lmax": 2, "n_rad_max": 5, "prod_func_n_max": 6, **SMALL}),
     "two": (
         "GRACE_2LAYER_latest",
-        "{lmax: [3, 2], n_rad_max: [6, 5], prod_func_n_max: [6, 5], max_order: 4, indicator_lmax: 1, n_mlp_dens: 4, "
-        "n_rad_base: 4, embedding_size: 8}",
+        {"lmax": [3, 2], "n_rad_max": [6, 5], "prod_func_n_max": [6, 5], "indicator_lmax": 1, **SMALL},
     ),
 }
 INPUT = """
@@ -82,6 +81,28 @@ def frames() -> list[Atoms]:
     return made
 
 
+def untrained(kind: str, work: Path) -> None:
+    """Writes a model of random weights, in seconds, and an artifact that has the projection and nothing else."""
+    import tensorpotential  # noqa: F401  - before tensorflow
+
+    import tensorflow as tf
+    from tensorpotential.cli.prepare import construct_model
+    from tensorpotential.instructions.base import save_instructions_dict
+    from tensorpotential.tensorpot import TensorPotential
+    from tensorpotential.uq.factories import make_basis_rp_spec
+
+    preset, kwargs = KINDS[kind]
+    config = {"preset": preset, "kwargs": dict(kwargs), "dense_nbr": False}
+    tf.random.set_seed(1)
+    elements = {symbol: number for number, symbol in enumerate(ELEMENTS)}
+    instructions, _ = construct_model(config, elements, rcut=CUTOFF, avg_n_neigh=20.0)
+    save_instructions_dict(str(work / "model.yaml"), instructions, param_dtype="float64")
+    potential = TensorPotential(instructions, param_dtype=tf.float64, seed=1, eager_mode=True)
+    potential.save_checkpoint(checkpoint_name=str(work / "checkpoint"))
+    spec = make_basis_rp_spec(str(work / "model.yaml"), rp_dim=16, normalize=True, add_density_channel=True)
+    np.savez(work / "gmm_artifacts.npz", **{key: value for key, value in spec.items() if value is not None})
+
+
 def program(work: Path, name: str, *words: object) -> None:
     """Runs a program of gracemaker in WORK."""
     command = [str(Path(sys.executable).parent / name), *map(str, words)]
@@ -93,7 +114,7 @@ def main() -> None:
     work.mkdir(parents=True, exist_ok=True)
     write(work / "frames.extxyz", frames())
     preset, kwargs = KINDS[kind]
-    (work / "input.yaml").write_text(INPUT.format(cutoff=CUTOFF, preset=preset, kwargs=kwargs))
+    (work / "input.yaml").write_text(INPUT.format(cutoff=CUTOFF, preset=preset, kwargs=json.dumps(kwargs)))
     program(work, "gracemaker", "input.yaml")
     trained = work / "seed" / "42"
     shutil.copy(trained / "model.yaml", work)
