@@ -1,7 +1,7 @@
 """Checks of an adapter on small structures: `python -m calmwalk.check ADAPTER MODEL`.
 
-Each check returns an error relative to the largest number that it compares, so that limits do not depend on a model's units.
-calmwalk checks a model by itself when it starts one; these are for those who write an adapter.
+Each check returns an error relative to the largest number that it compares, so that limits do not depend on a model's
+units. calmwalk checks a model by itself when it starts one; these are for those who write an adapter.
 """
 
 from __future__ import annotations

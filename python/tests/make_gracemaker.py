@@ -1,5 +1,6 @@
-"""Trains two tiny GRACE models for Al and Cu, of one and of two layers, with their mixtures and exports: what tests of the
-gracemaker adapter take. Labels come from the radial model, so nothing but gracemaker is needed. A few minutes on one core.
+"""Trains two tiny GRACE models for Al and Cu, of one and of two layers, with their mixtures and exports: what tests
+of the gracemaker adapter take. Labels come from the radial model, so nothing but gracemaker is needed. A few minutes
+on one core.
 
     python make_gracemaker.py one WORK1        # python: one with gracemaker, whose programs are beside it
     python make_gracemaker.py two WORK2
@@ -20,14 +21,14 @@ from typing import Any
 os.environ.update({name: "1" for name in ("OMP_NUM_THREADS", "TF_NUM_INTRAOP_THREADS", "TF_NUM_INTEROP_THREADS")})
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-import numpy as np  # noqa: E402
-from ase import Atoms  # noqa: E402
-from ase.build import bulk  # noqa: E402
-from ase.calculators.singlepoint import SinglePointCalculator  # noqa: E402
-from ase.io import write  # noqa: E402
+import numpy as np
+from ase import Atoms
+from ase.build import bulk
+from ase.calculators.singlepoint import SinglePointCalculator
+from ase.io import write
 
-from calmwalk.adapters.radial import Radial  # noqa: E402
-from calmwalk.neighbours import Structure, batch_of  # noqa: E402
+from calmwalk.adapters.radial import Radial
+from calmwalk.neighbours import Structure, batch_of
 
 ELEMENTS = ["Al", "Cu"]
 CUTOFF = 4.5
@@ -85,6 +86,7 @@ def untrained(kind: str, work: Path) -> None:
     """Writes a model of random weights, in seconds, and an artifact that has the projection and nothing else."""
     import tensorpotential  # noqa: F401  - before tensorflow
 
+    # isort: split
     import tensorflow as tf
     from tensorpotential.cli.prepare import construct_model
     from tensorpotential.instructions.base import save_instructions_dict

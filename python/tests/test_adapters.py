@@ -1,6 +1,7 @@
 """Derivatives, batches, padding, permutation and repeats of every adapter.
 
-Tests of a framework that is missing are left out, but fail if CALMWALK_REQUIRE_ADAPTERS names its adapter ("mace gracemaker ase").
+Tests of a framework that is missing are left out, but fail if CALMWALK_REQUIRE_ADAPTERS names its adapter ("mace
+gracemaker ase").
 """
 
 from __future__ import annotations
@@ -181,9 +182,11 @@ class AseCalculators(Checks):
     def test_a_file_that_defines_a_calculator(self) -> None:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "mine.py"
-            file.write_text(
-                "from ase.calculators.lj import LennardJones\ncalculator = LennardJones(sigma=2.3, rc=6.0, smooth=True)\n"
-            )
+            lines = [
+                "from ase.calculators.lj import LennardJones",
+                "calculator = LennardJones(sigma=2.3, rc=6, smooth=True)",
+            ]
+            file.write_text("\n".join(lines))
             adapter = find_adapter("ase")(file, {"elements": ["Al"]})
             self.assertEqual(adapter.info.features.dimension, 0)
             self.check(adapter)

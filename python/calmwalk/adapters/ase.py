@@ -1,14 +1,15 @@
-"""Any calculator of ASE: energies and forces for unbiased walks, control walks and labels. It has no features, so no grade.
+"""Any calculator of ASE: energies and forces for unbiased walks, control walks and labels. It has no features, so no
+grade.
 
-The model is a Python file that defines `calculator`, a calculator or a function without arguments that makes one; or, without a
-model, the option `calculator` names a class or function as "module:name" or "/path/file.py:name", called with the keyword arguments
-of the option `arguments`.
+The model is a Python file that defines `calculator`, a calculator or a function without arguments that makes one; or,
+without a model, the option `calculator` names a class or function as "module:name" or "/path/file.py:name", called
+with the keyword arguments of the option `arguments`.
 
 Other options: `elements`, the symbols that the calculator can treat (all, if not given); `numerical_stress`, true for a
 calculator without stress, which then takes twelve more energies a call.
 
-Energies of atoms are the calculator's own where they sum to its energy; else each atom has an equal share. Where the calculator
-knows the free energy with which its forces are consistent, that is the energy.
+Energies of atoms are the calculator's own where they sum to its energy; else each atom has an equal share. Where the
+calculator knows the free energy with which its forces are consistent, that is the energy.
 """
 
 from __future__ import annotations
@@ -115,12 +116,13 @@ class Ase:
     def _virial(self, atoms: ase.Atoms, forces: np.ndarray) -> np.ndarray:
         """−∂E/∂ε, eV."""
         if not atoms.pbc.any():
-            virial = forces.T @ atoms.positions
-            return (virial + virial.T) / 2
+            moments: np.ndarray = forces.T @ atoms.positions
+            return (moments + moments.T) / 2
         if self._numerical_stress:
             return self._numerical_virial(atoms)
         try:
-            return np.asarray(-atoms.get_stress(voigt=False) * atoms.get_volume())
+            stress: np.ndarray = atoms.get_stress(voigt=False)
+            return -stress * float(atoms.get_volume())
         except (NotImplementedError, PropertyNotImplementedError):
             name = type(self._calculator).__name__
             raise AdapterError(

@@ -1,12 +1,13 @@
 """GRACE models of gracemaker (tensorpotential 0.6.2) in TensorFlow, from a checkpoint.
 
-The model is a folder with `model.yaml` and a checkpoint. With the option `artifact`, the file `gmm_artifacts.npz` of `grace_uq build`,
-the features are the final ones, projected with the artifact's matrix; without it they are the invariants of the basis, block by block.
+The model is a folder with `model.yaml` and a checkpoint. With the option `artifact`, the file `gmm_artifacts.npz` of
+`grace_uq build`, the features are the final ones, projected with the artifact's matrix; without it they are the
+invariants of the basis, block by block.
 
 Options: `artifact`; `checkpoint`, the name of a checkpoint in the folder ("checkpoint" if not given).
 
-XLA compiles each function anew for each number of atoms, bonds and structures, which takes seconds to a minute: batches must be padded
-to few shapes. Compiled code is kept in the folder `cache`.
+XLA compiles each function anew for each number of atoms, bonds and structures, which takes seconds to a minute:
+batches must be padded to few shapes. Compiled code is kept in the folder `cache`.
 """
 
 from __future__ import annotations
@@ -135,8 +136,8 @@ class _Graph:
         return [sum(_columns(reduce, source) for source in reduce.instructions) for reduce in self._reduces]
 
     def functions(self) -> tuple[Callable[..., Any], Callable[..., Any]]:
-        """Compiled functions of the inputs: energies, features, forces, virials; and, with cotangents of energies and features,
-        gradients by position and strain."""
+        """Compiled functions of the inputs: energies, features, forces, virials; and, with cotangents of energies and
+        features, gradients by position and strain."""
         tf = self._tf
         signature = [self._input(name) for name in _INPUTS]
         cotangents = [tf.TensorSpec([None], tf.float64), tf.TensorSpec([None, None], tf.float64)]
@@ -265,7 +266,8 @@ def _files(folder: Path, name: Optional[str]) -> tuple[Path, Path]:
 
 
 def _framework(threads: int, cache: Optional[Path]) -> Any:
-    """TensorFlow, after the variables that it reads when it is imported. tensorpotential comes first, since it sets some."""
+    """TensorFlow, after the variables that it reads when it is imported. tensorpotential comes first, since it sets
+    some."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     if cache is not None:
         cache.mkdir(parents=True, exist_ok=True)
@@ -328,12 +330,7 @@ def _cast(tf: Any, factories: Any, source: Any, yaml: str, feature_spec: dict[st
 def _no_compute_function() -> Any:
     """TensorPotential wants a compute function. Ours run the instructions themselves."""
     base = importlib.import_module("tensorpotential.tpmodel").ComputeFunction
-
-    class NoComputeFunction(base):  # type: ignore[misc]
-        def __call__(self, *_: Any, **__: Any) -> Any:
-            raise NotImplementedError
-
-    return NoComputeFunction()
+    return type("NoComputeFunction", (base,), {"__call__": lambda *_, **__: None})()
 
 
 def _columns(reduce: Any, source: Any) -> int:

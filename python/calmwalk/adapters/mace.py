@@ -1,8 +1,8 @@
 """MACE (mace-torch) in PyTorch.
 
-The features are the invariants of each interaction layer: the 0e columns of `node_feats`, as MACE's own calculator gives them
-with `get_descriptors(invariants_only=True)`, but as part of the graph. The model is a file of `torch.save`, which runs code when
-it is read: take it only from those whom you trust.
+The features are the invariants of each interaction layer: the 0e columns of `node_feats`, as MACE's own calculator
+gives them with `get_descriptors(invariants_only=True)`, but as part of the graph. The model is a file of
+`torch.save`, which runs code when it is read: take it only from those whom you trust.
 
 Option: `head`, of a model with several.
 """
@@ -91,7 +91,8 @@ class Mace:
         return Gradients(*graph.backward(outputs, tensors, keep=batch.kept is not None))
 
     def _forward(self, batch: Batch) -> _Graph:
-        """Positions are zero and the bonds are MACE's shifts, so that no cell is needed and autograd gives ∂/∂(bond)."""
+        """Positions are zero and the bonds are MACE's shifts, so that no cell is needed and autograd gives
+        ∂/∂(bond)."""
         near = np.flatnonzero(np.einsum("bx,bx->b", batch.bonds, batch.bonds) < self._cutoff**2)
         bonds = self._tensor(batch.bonds[near], self._type).requires_grad_(True)
         ends = self._tensor(np.stack([batch.centres[near], batch.neighbours[near]]), torch.int64)
@@ -203,4 +204,4 @@ def _versions() -> dict[str, str]:
 
 
 def _numpy(tensor: torch.Tensor) -> np.ndarray:
-    return tensor.detach().cpu().numpy().astype(np.float64)
+    return np.asarray(tensor.detach().cpu().numpy(), dtype=np.float64)
