@@ -117,7 +117,8 @@ class Ase:
         """−∂E/∂ε, eV."""
         if not atoms.pbc.any():
             moments: np.ndarray = forces.T @ atoms.positions
-            return (moments + moments.T) / 2
+            virial: np.ndarray = (moments + moments.T) / 2
+            return virial
         if self._numerical_stress:
             return self._numerical_virial(atoms)
         try:
