@@ -61,6 +61,7 @@ class Mace:
         self._head = _head(path, self._model, options.get("head"))
         columns, blocks = _invariant_columns(self._model)
         self._columns = torch.tensor(columns, device=self._device)
+        self._passes = 0
         elements = _symbols(self._model.atomic_numbers.tolist())
         self.info = ModelInfo(
             elements=elements,
@@ -73,11 +74,11 @@ class Mace:
         )
 
     def evaluate(self, batch: Batch, features: bool) -> Evaluation:
-        graph = self._forward(batch)
+        graph, compiled = self._forward(batch), self._warming
         forces, virials = graph.backward([graph.energies], [torch.ones_like(graph.energies)], features)
         batch.kept = graph if features else None
         values = _numpy(graph.features) if features else None
-        return Evaluation(_numpy(graph.energies), values, -forces, -virials)
+        return Evaluation(_numpy(graph.energies), values, -forces, -virials, compiled)
 
     def pull_back(
         self, batch: Batch, feature_cotangents: np.ndarray, energy_cotangents: Optional[np.ndarray] = None
@@ -90,9 +91,15 @@ class Mace:
         tensors = [self._tensor(array, output.dtype) for array, output in zip(cotangents, outputs)]
         return Gradients(*graph.backward(outputs, tensors, keep=batch.kept is not None))
 
+    @property
+    def _warming(self) -> bool:
+        """Whether the last forward pass was one of the first two, in which TorchScript optimises the code of e3nn."""
+        return self._passes <= 2
+
     def _forward(self, batch: Batch) -> _Graph:
         """Positions are zero and the bonds are MACE's shifts, so that no cell is needed and autograd gives
         ∂/∂(bond)."""
+        self._passes += 1
         near = np.flatnonzero(np.einsum("bx,bx->b", batch.bonds, batch.bonds) < self._cutoff**2)
         bonds = self._tensor(batch.bonds[near], self._type).requires_grad_(True)
         ends = self._tensor(np.stack([batch.centres[near], batch.neighbours[near]]), torch.int64)
