@@ -48,7 +48,7 @@ class Checks(unittest.TestCase):
 
 class RadialModel(Checks):
     def test_checks(self) -> None:
-        for model in ("radial-al.json", "radial-alcu.json"):
+        for model in ("radial-al.json", "radial-al-short.json", "radial-alcu.json"):
             for precision in ("double", "single"):
                 with self.subTest(model=model, precision=precision):
                     self.check(Radial(DATA / model, {}, precision=precision))
