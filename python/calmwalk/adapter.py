@@ -22,7 +22,8 @@ class Features:
     """The numbers per atom that CALM grades."""
 
     form: str
-    """"final": used as they are; "raw": invariants that calmwalk normalises and projects; "none": energies and forces only."""
+    """"final": used as they are; "raw": invariants that calmwalk normalises and projects; "none": energies and forces
+    only."""
     blocks: Sequence[int] = ()
     """Number of columns of each layer; their sum is the dimension D."""
 
@@ -89,8 +90,8 @@ class Gradients:
 
 
 class Adapter(Protocol):
-    """A potential behind calmwalk. It is constructed with `(model: Path | None, options: dict, device: str, precision: str,
-    threads: int, cache: Path | None)`, all from the configuration.
+    """A potential behind calmwalk. It is constructed with `(model: Path | None, options: dict, device: str,
+    precision: str, threads: int, cache: Path | None)`, all from the configuration.
 
     Not a single result may depend on what else is in the batch: each atom sees its own structure only.
     """
@@ -104,14 +105,14 @@ class Adapter(Protocol):
     def pull_back(
         self, batch: Batch, feature_cotangents: np.ndarray, energy_cotangents: Optional[np.ndarray] = None
     ) -> Gradients:
-        """Gradient of Σ z̄·z, z̄ of the shape [A, D], plus Σ ē·E, ē of the shape [A], if it is given. `batch.kept` is what
-        the evaluation of the same inputs left there, or None: then compute forward again."""
+        """Gradient of Σ z̄·z, z̄ of the shape [A, D], plus Σ ē·E, ē of the shape [A], if it is given. `batch.kept` is
+        what the evaluation of the same inputs left there, or None: then compute forward again."""
         ...
 
 
 def identity(files: Iterable[Path], adapter: type, definition: Any = None) -> str:
-    """Hash of the names' order and contents of files, of the adapter's source, and of a definition of the features (anything
-    that JSON holds): 64 hexadecimal digits."""
+    """Hash of the names' order and contents of files, of the adapter's source, and of a definition of the features
+    (anything that JSON holds): 64 hexadecimal digits."""
     digest = hashlib.sha256()
     for file in files:
         digest.update(hashlib.sha256(file.read_bytes()).digest())

@@ -146,7 +146,8 @@ def _view(
         raise InputError(f"section {name} ends at byte {end}, but the arena has {arena.bytes}")
     if 0 in sizes:
         return np.empty(sizes, dtype)
-    return np.ndarray(sizes, dtype, arena.map, offset)
+    view: np.ndarray = np.ndarray(sizes, dtype, arena.map, offset)
+    return view
 
 
 def _keep_while_topology_stays(arena: Arena, topology: int, shape: tuple[int, ...]) -> None:

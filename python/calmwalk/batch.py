@@ -19,13 +19,14 @@ class Counts:
 
 @dataclass
 class Batch:
-    """S structures with A atoms and B directed bonds in all. The arrays are views of shared memory: do not write to them,
-    and copy what must outlive the call.
+    """S structures with A atoms and B directed bonds in all. The arrays are views of shared memory: do not write to
+    them, and copy what must outlive the call.
 
     With padding the last structure, its atoms and its bonds are spare: the bonds are longer than every cutoff. A batch
     without padding has none, and `real` equals the shapes. Results of spare atoms are not read.
 
-    Bonds come sorted by centre. They may be longer than the cutoff, since the list has a skin: these contribute exactly zero.
+    Bonds come sorted by centre. They may be longer than the cutoff, since the list has a skin: these contribute
+    exactly zero.
     """
 
     species: np.ndarray
@@ -49,7 +50,8 @@ class Batch:
     real: Counts
     """What of the batch is not padding."""
     kept: Any = None
-    """Free for the adapter: what its evaluation puts here, a pull-back of the same inputs finds here. None otherwise."""
+    """Free for the adapter: what its evaluation puts here, a pull-back of the same inputs finds here. None
+    otherwise."""
     fixed: dict[str, Any] = field(default_factory=dict)
     """Free for the adapter: keeps its entries as long as species, maps, centres and neighbours stay what they are."""
 

@@ -1,7 +1,7 @@
 """Checks of an adapter on small structures: `python -m calmwalk.check ADAPTER MODEL`.
 
-Each check returns an error relative to the largest number that it compares, so that limits do not depend on a model's units.
-calmwalk checks a model by itself when it starts one; these are for those who write an adapter.
+Each check returns an error relative to the largest number that it compares, so that limits do not depend on a model's
+units. calmwalk checks a model by itself when it starts one; these are for those who write an adapter.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Callable, Optional
+from typing import Any, Callable, Optional
 
 import numpy as np
 
 from .adapter import Adapter, Evaluation
-from .batch import Batch
+from .batch import Batch, Counts
 from .loading import find_adapter
 from .neighbours import Structure, batch_of
 
@@ -35,7 +35,8 @@ class Check:
         self._random = np.random.default_rng(seed)
         self._skin = float(np.max(adapter.info.cutoffs)) + 0.5
         self.structures = [self._cluster(distance, 9), self._crystal(distance), self._cluster(distance, 2)]
-        self.cotangents: Optional[np.ndarray] = None
+        largest = batch_of(self.structures, self._skin + 0.5).real
+        self._room = Counts(largest.structures + 1, largest.atoms + 1, largest.bonds)
 
     def all(self) -> dict[str, float]:
         """Relative error of each check, by name."""
@@ -57,7 +58,9 @@ class Check:
         batch = self._batch()
         forces = self.adapter.evaluate(batch, False).forces
         largest = np.abs(forces).max()
-        return max(_error(forces[at], -self._slope(self._energy, self._moved(*at)), largest) for at in self._coordinates())
+        return max(
+            _error(forces[at], -self._slope(self._energy, self._moved(*at)), largest) for at in self._coordinates()
+        )
 
     def virials(self) -> float:
         """Virials against central differences of the energy by strain."""
@@ -96,7 +99,7 @@ class Check:
 
     def batch(self) -> float:
         """One batch of all structures against one batch for each."""
-        singles = [self.adapter.evaluate(self._batch([s]), self._has_features()) for s in self.structures]
+        singles = [self._evaluate([structure]) for structure in self.structures]
         return self._difference(self._evaluate(self.structures), _joined(singles))
 
     def permutation(self) -> float:
@@ -116,24 +119,29 @@ class Check:
     def padding(self) -> float:
         """A batch with spare structures, atoms and bonds against one without."""
         cutoff = self._skin
-        padded = self.adapter.evaluate(batch_of(self.structures, cutoff, (1, 3, 17)), self._has_features())
+        spare = (1, 3, 17)
+        padded = self.adapter.evaluate(batch_of(self.structures, cutoff, spare), self._has_features())
         padded.energies, padded.forces, padded.virials = padded.energies[:-3], padded.forces[:-3], padded.virials[:-1]
         padded.features = None if padded.features is None else padded.features[:-3]
         return self._difference(self._evaluate(self.structures), padded)
 
     def beyond_cutoff(self) -> float:
         """A list with a skin against one up to the cutoff."""
-        short = batch_of(self.structures, self._skin - 0.5 + 1e-9, self._spare())
-        return self._difference(self._evaluate(self.structures), self.adapter.evaluate(short, self._has_features()))
+        short = self.adapter.evaluate(self._batch(cutoff=self._skin - 0.5 + 1e-9), self._has_features())
+        return self._difference(self._evaluate(self.structures), short)
 
     def _has_features(self) -> bool:
         return self.info.features.form != "none"
 
-    def _spare(self) -> tuple[int, int, int]:
-        return (1, 1, 1) if self.info.padding else (0, 0, 0)
-
-    def _batch(self, structures: Optional[list[Structure]] = None) -> Batch:
-        return batch_of(self.structures if structures is None else structures, self._skin, self._spare())
+    def _batch(self, structures: Optional[list[Structure]] = None, cutoff: Optional[float] = None) -> Batch:
+        """With padding, all batches have one shape."""
+        structures, cutoff = self.structures if structures is None else structures, cutoff or self._skin
+        batch, room = batch_of(structures, cutoff), self._room
+        if not self.info.padding:
+            return batch
+        real = batch.real
+        spare = (room.structures - real.structures, room.atoms - real.atoms, room.bonds - real.bonds)
+        return batch_of(structures, cutoff, spare)
 
     def _evaluate(self, structures: list[Structure]) -> Evaluation:
         """Without the spare rows."""
@@ -239,7 +247,7 @@ def _joined(results: list[Evaluation]) -> Evaluation:
     )
 
 
-def _error(one: np.ndarray, other: np.ndarray, scale: Optional[float] = None) -> float:
+def _error(one: Any, other: Any, scale: Optional[float] = None) -> float:
     one, other = np.asarray(one, dtype=float), np.asarray(other, dtype=float)
     if one.size == 0:
         return 0.0
@@ -249,7 +257,9 @@ def _error(one: np.ndarray, other: np.ndarray, scale: Optional[float] = None) ->
 
 def main() -> int:
     """Prints the checks of an adapter; 1 if one is not passed."""
-    parser = argparse.ArgumentParser(prog="python -m calmwalk.check", description="Checks an adapter on small structures.")
+    parser = argparse.ArgumentParser(
+        prog="python -m calmwalk.check", description="Checks an adapter on small structures."
+    )
     parser.add_argument("adapter", help="a built-in adapter, 'module:ClassName' or '/path/file.py:ClassName'")
     parser.add_argument("model", nargs="?", type=Path)
     parser.add_argument("--options", type=json.loads, default={}, help="options of the adapter, JSON")

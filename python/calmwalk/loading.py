@@ -24,8 +24,10 @@ def find_adapter(name: str) -> type:
     where, _, attribute = BUILT_IN.get(name, name).rpartition(":")
     if not where:
         names = ", ".join(BUILT_IN)
-        raise InputError(f"the adapter is '{name}', expected one of {names}, 'module:ClassName' or '/path/file.py:ClassName'")
-    return getattr_or_refuse(load_module(where), attribute)
+        expected = f"one of {names}, 'module:ClassName' or '/path/file.py:ClassName'"
+        raise InputError(f"the adapter is '{name}', expected {expected}")
+    found: type = getattr_or_refuse(load_module(where), attribute)
+    return found
 
 
 def load_module(where: str) -> Any:

@@ -25,8 +25,8 @@ class Structure:
 
 
 def bonds_of(structure: Structure, cutoff: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All directed bonds up to a length, Å, sorted by centre: centres [b], neighbours [b], vectors [b, 3]. Tries all pairs of
-    atoms in all images that can be near enough."""
+    """All directed bonds up to a length, Å, sorted by centre: centres [b], neighbours [b], vectors [b, 3]. Tries all
+    pairs of atoms in all images that can be near enough."""
     found = []
     for image in product(*(range(-n, n + 1) for n in _images(structure, cutoff))):
         shift = np.array(image) @ structure.cell
@@ -52,8 +52,8 @@ def _images(structure: Structure, cutoff: float) -> list[int]:
 
 
 def batch_of(structures: Sequence[Structure], cutoff: float, spare: tuple[int, int, int] = (0, 0, 0)) -> Batch:
-    """One batch of structures with all bonds up to a length, Å, and spare structures, atoms and bonds: of each kind at least one,
-    or all three zero."""
+    """One batch of structures with all bonds up to a length, Å, and spare structures, atoms and bonds: of each kind
+    at least one, or all three zero."""
     bonds = [bonds_of(structure, cutoff) for structure in structures]
     atoms = [len(structure.species) for structure in structures]
     starts = np.concatenate([[0], np.cumsum(atoms)])[:-1]
@@ -73,7 +73,9 @@ def batch_of(structures: Sequence[Structure], cutoff: float, spare: tuple[int, i
         structure_of_atom=padded([np.repeat(which, atoms)], more_atoms, last_structure, np.int32),
         centres=padded([i + start for (i, _, _), start in zip(bonds, starts)], more_bonds, last_atom, np.int32),
         neighbours=padded([j + start for (_, j, _), start in zip(bonds, starts)], more_bonds, last_atom, np.int32),
-        structure_of_bond=padded([np.repeat(which, [len(v) for _, _, v in bonds])], more_bonds, last_structure, np.int32),
+        structure_of_bond=padded(
+            [np.repeat(which, [len(v) for _, _, v in bonds])], more_bonds, last_structure, np.int32
+        ),
         bonds=vectors,
         positions=padded([s.positions for s in structures], more_atoms, 0.0, np.float64),
         cells=padded([s.cell[None] for s in structures], more_structures, 0.0, np.float64),

@@ -1,7 +1,7 @@
 """Serves one potential to calmwalk: `python -m calmwalk.server`. See docs/python-protocol.md.
 
-Messages come from standard input and are answered on what was standard output at the start. Standard output then goes to
-standard error, so that what libraries print cannot mix with answers.
+Messages come from standard input and are answered on what was standard output at the start. Standard output then goes
+to standard error, so that what libraries print cannot mix with answers.
 """
 
 from __future__ import annotations

@@ -89,7 +89,9 @@ class Client:
                 inputs["energy_cotangents"] = energy
         outputs = ["energies", "forces", "virials"] + (["features"] if features else [])
         shared = self._arenas.setdefault(arena, SharedFile())
-        shared.fill(batch, self.dimension, inputs, ["gradients", "gradient_virials"] if name == "pull_back" else outputs)
+        shared.fill(
+            batch, self.dimension, inputs, ["gradients", "gradient_virials"] if name == "pull_back" else outputs
+        )
         message = {
             "call": name,
             "id": identifier,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from calmwalk.adapters.radial import Radial
+from calmwalk.arenas import _INPUTS
 from calmwalk.check import Check
 from calmwalk.neighbours import Structure, batch_of
 
@@ -141,8 +142,7 @@ class Errors(unittest.TestCase):
         with Client() as client, tempfile.NamedTemporaryFile() as file:
             file.truncate(6400)
             client.hello("radial", MODEL)
-            names = "species structure_of_atom centres neighbours structure_of_bond bonds positions cells periodic".split()
-            names += ["energies", "forces", "virials"]
+            names = [*_INPUTS, "energies", "forces", "virials"]
             message: dict[str, Any] = dict(call="evaluate", id=1, arena=0, path=file.name, bytes=6400)
             message.update(structures=1, atoms=2, bonds=2, real=dict(structures=1, atoms=2, bonds=2), topology=1)
             message.update(features=False, sections={name: 128 * i for i, name in enumerate(names)})

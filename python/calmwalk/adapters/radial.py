@@ -1,4 +1,5 @@
-"""A complete potential in plain numpy, for tests: smooth radial symmetry functions and energies that depend smoothly on them.
+"""A complete potential in plain numpy, for tests: smooth radial symmetry functions and energies that depend smoothly
+on them.
 
 Features of atom i, for each function k and each element t of a neighbour:
 
@@ -8,9 +9,10 @@ and the energy of an atom of element s, as of Finnis and Sinclair with the symme
 
     E_i = E⁰_s + Σ_tk a_stk G_i,tk − √(Σ_tk b_stk G_i,tk + δ_s) + √δ_s,   b ≥ 0, δ > 0
 
-The model is a file of JSON with `elements`, `cutoff` (Å), `blocks` (lists of functions, each {"centre": c, "width": w} in Å; a block
-stands for a layer of a larger model), and for each element `shift` E⁰ (eV), `linear` a (eV), `embedding` b (eV²) and `floor` δ (eV²);
-a and b have a number for each column of the features. Columns are sorted by block, then by the neighbour's element, then by function.
+The model is a file of JSON with `elements`, `cutoff` (Å), `blocks` (lists of functions, each {"centre": c, "width":
+w} in Å; a block stands for a layer of a larger model), and for each element `shift` E⁰ (eV), `linear` a (eV),
+`embedding` b (eV²) and `floor` δ (eV²); a and b have a number for each column of the features. Columns are sorted by
+block, then by the neighbour's element, then by function.
 """
 
 from __future__ import annotations

@@ -5,27 +5,33 @@ A call ends `base_seconds` + `seconds_per_structure` × structures after it bega
 Options, all with a default that does nothing:
 
 - `base_seconds`, `seconds_per_structure`: the time of a call
-- `compile_seconds`: more time for the first evaluate and pull_back of each shape, which then report `compiled`; implies `padding`
+- `compile_seconds`: more time for the first evaluate and pull_back of each shape, which then report `compiled`;
+  implies `padding`
 - `padding`: ask for padded batches
 - `max_structures`: what hello reports
 - `memory_above`: a call with more structures than this is out of memory
 - `fault`, `fault_call`, `fault_at`: a fault at the n-th call (from 1) of a kind: hello, evaluate (default) or pull_back
-- `control`: path of a file, looked for at each evaluate and pull_back. It has a fault a line; it is removed when it is read, and its
-  faults happen at this and the next calls, one at each. "memory_above 8" sets that option and is not a fault.
-- `count`: path of a file to which each call appends a line: kind, structures, atoms, bonds (with padding), real structures
-- `bend`: {"forces": 1.1, …} multiplies a result (forces, virials, gradients, gradient_virials) by a factor: a model with wrong derivatives
+- `control`: path of a file, looked for at each evaluate and pull_back. It has a fault a line; it is removed when it
+  is read, and its faults happen at this and the next calls, one at each. "memory_above 8" sets that option and is not
+  a fault.
+- `count`: path of a file to which each call appends a line: kind, structures, atoms, bonds (with padding), real
+  structures
+- `bend`: {"forces": 1.1, …} multiplies a result (forces, virials, gradients, gradient_virials) by a factor: a model
+  with wrong derivatives
 - `noise`: relative noise of the energies, another in each call: a model that is not deterministic
 - `order`: energies differ by this times the atom's index: a model that permutations change
 - `crowd`: energies differ by this times the number of structures: a model that the composition of a batch changes
 
-Faults: "exit" (the process ends with status 3), "hang" (sleeps without end), "slow" (ten seconds more), "nan" (the first force, or
-gradient, is not a number), "shape" (forces, or gradients, of one atom less), "type" (of whole numbers), "exception", "memory",
-"import" (of a module that does not exist), "print" (writes to standard output, which must not harm).
+Faults: "exit" (the process ends with status 3), "hang" (sleeps without end), "slow" (ten seconds more), "nan" (the
+first force, or gradient, is not a number), "shape" (forces, or gradients, of one atom less), "type" (of whole
+numbers), "exception", "memory", "import" (of a module that does not exist), "print" (writes to standard output, which
+must not harm).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import os
 import time
 from collections import Counter, deque
@@ -194,7 +200,7 @@ def _happen(fault: str) -> None:
     if fault == "memory":
         raise MemoryError("a fault that was asked for")
     if fault == "import":
-        import calmwalk_missing_module  # type: ignore[import-not-found]  # noqa: F401
+        importlib.import_module("calmwalk_missing_module")
     if fault == "print":
         os.write(1, b"a library prints to standard output\n")
 
