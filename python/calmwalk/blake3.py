@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Words = NDArray[np.uint32]
+Integers = NDArray[np.int64]
 
 _IV = np.array(
-    [0x6A09E667, 0xBB67AE85, 0x3C6EF372, 0xA54FF53A, 0x510E527F, 0x9B05688C, 0x1F83D9AB, 0x5BE0CD19], np.uint32
+    [0x6A09E667, 0xBB67AE85, 0x3C6EF372, 0xA54FF53A, 0x510E527F, 0x9B05688C, 0x1F83D9AB, 0x5BE0CD19],
+    np.uint32,
 )
 _PERMUTATION = [2, 6, 3, 10, 7, 0, 4, 13, 1, 11, 12, 5, 9, 14, 15, 8]
 _ROUNDS = 7
@@ -28,7 +30,7 @@ def blake3(data: bytes) -> str:
     values = _chunk_values(data, chunks)
     while len(values) > 1:
         values = _parents(values)
-    return values[0].astype("<u4").tobytes().hex()
+    return bytes(values[0].astype("<u4")).hex()
 
 
 def _chunk_values(data: bytes, chunks: int) -> Words:
@@ -60,11 +62,13 @@ def _parents(values: Words) -> Words:
     messages = values[: 2 * pairs].reshape(pairs, 16)
     flags = _PARENT | (_ROOT if len(values) == 2 else 0)
     chaining = np.repeat(_IV[None], pairs, axis=0)
-    joined = _compress(chaining, messages, np.zeros(pairs), np.full(pairs, _BLOCK), np.full(pairs, flags))
+    joined = _compress(
+        chaining, messages, np.zeros(pairs, np.int64), np.full(pairs, _BLOCK), np.full(pairs, flags)
+    )
     return np.concatenate([joined, values[2 * pairs :]])
 
 
-def _compress(chaining: Words, message: Words, counter: NDArray, length: NDArray, flags: NDArray) -> Words:
+def _compress(chaining: Words, message: Words, counter: Integers, length: Integers, flags: Integers) -> Words:
     """The first eight words of the compression function, [k, 8]."""
     low = counter.astype(np.uint64)
     v = [*chaining.T.copy(), *(np.full(len(chaining), word) for word in _IV[:4])]

@@ -102,7 +102,9 @@ class Component:
         """C = scatter / effective count, [D, D]; zero for an empty component."""
         if self.scatter is None or self.effective_count is None:
             return None
-        return self.scatter / self.effective_count if self.effective_count > 0 else np.zeros_like(self.scatter)
+        return (
+            self.scatter / self.effective_count if self.effective_count > 0 else np.zeros_like(self.scatter)
+        )
 
 
 def decode_block(data: bytes) -> Block:
@@ -115,7 +117,21 @@ def decode_block(data: bytes) -> Block:
             f"candidate block too short: {len(data)} bytes, the header alone has {_HEADER.size}"
         )
     header = _HEADER.unpack_from(data)
-    magic, version, expected, length, n, dimension, campaign, content, walk, segment, step, mixture, origin = header[:13]
+    (
+        magic,
+        version,
+        expected,
+        length,
+        n,
+        dimension,
+        campaign,
+        content,
+        walk,
+        segment,
+        step,
+        mixture,
+        origin,
+    ) = header[:13]
     if magic != _BLOCK_MAGIC:
         raise DamagedError(f"not a candidate block: it begins with {magic!r}, expected {_BLOCK_MAGIC!r}")
     if version != _BLOCK_VERSION:
@@ -212,14 +228,14 @@ def decode_numbers(data: bytes) -> Floats:
 
 def _decompressed(frame: bytes, limit: int) -> bytes:
     try:
-        from compression import zstd  # type: ignore[import-not-found]  # Python 3.14
+        from compression import zstd  # Python 3.14
 
         # One byte more than expected is enough to detect excess data.
         return bytes(zstd.ZstdDecompressor().decompress(frame, limit + 1))
     except ImportError:
         pass
     try:
-        import zstandard  # type: ignore[import-not-found]
+        import zstandard
 
         return bytes(zstandard.ZstdDecompressor().decompress(frame, max_output_size=limit + 1))
     except ImportError:

@@ -58,7 +58,9 @@ class Campaign:
     def __enter__(self) -> Campaign:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
+    ) -> None:
         self.close()
 
     def __repr__(self) -> str:
@@ -96,7 +98,7 @@ class Campaign:
     @property
     def configuration(self) -> dict[str, Any]:
         """The configuration in force, with every default filled in."""
-        return json.loads(self._value("configuration_in_force"))
+        return dict(json.loads(self._value("configuration_in_force")))
 
     def candidates(
         self, *, protocol: str | None = None, features: bool = False, **filters: Any
@@ -115,7 +117,9 @@ class Campaign:
         if not rows:
             raise KeyError(f"{self.location} has no candidate {name}")
         decision = rows[0]["decision"]
-        return next(self.candidates(protocol=protocol, features=True, after=decision - 1, before=decision + 1))
+        return next(
+            self.candidates(protocol=protocol, features=True, after=decision - 1, before=decision + 1)
+        )
 
     def atoms(self, *, protocol: str | None = None, **filters: Any) -> Iterator[Any]:
         """Candidates as :class:`ase.Atoms`, with the names of an export (docs/export.md) and, in addition, ``decision``,
@@ -139,7 +143,11 @@ class Campaign:
         """Imported structures in the order of their import. ``found_by_walks=False`` leaves out those that are candidates
         too."""
         chosen = self._protocol(protocol)
-        others = "" if found_by_walks else "AND NOT EXISTS (SELECT 1 FROM candidate WHERE candidate.structure = import.structure)"
+        others = (
+            ""
+            if found_by_walks
+            else "AND NOT EXISTS (SELECT 1 FROM candidate WHERE candidate.structure = import.structure)"
+        )
         sql = f"""SELECT import.number AS place, {checksums.IMPORT.selected()}, {checksums.STRUCTURE.selected()}, {LABEL_COLUMNS}
             FROM import JOIN structure ON structure.number = import.structure
             LEFT JOIN label ON label.structure = import.structure AND label.protocol = ? AND label.status = 'label'
@@ -210,7 +218,9 @@ class Campaign:
         for row in self._store.rows("SELECT * FROM protocol ORDER BY number"):
             checksums.PROTOCOL.verify(row)
             found.append(
-                LabelProtocol(row["number"], bytes(row["hash"]).hex(), row["name"], json.loads(row["settings"]))
+                LabelProtocol(
+                    row["number"], bytes(row["hash"]).hex(), row["name"], json.loads(row["settings"])
+                )
             )
         return found
 
@@ -250,7 +260,9 @@ class Campaign:
 
         found = shutil.which(program)
         if found is None:
-            raise StoreError(f"a mixture needs the program '{program}', which is not on the path: give it by program=…")
+            raise StoreError(
+                f"a mixture needs the program '{program}', which is not on the path: give it by program=…"
+            )
         with tempfile.TemporaryDirectory() as directory:
             output = str(Path(directory) / "mixture.npz")
             command = [found, "calm", "export", self.location, "--output", output]
@@ -277,7 +289,9 @@ class Campaign:
         record = next((version for version in self.versions() if version.number == number), None)
         if record is None or record.state != "registered" or name not in ("model", "mixture"):
             raise KeyError(f"{self.location} has no {name} of a registered version {number}")
-        rows = self._store.rows("SELECT data FROM version_file WHERE version = ? AND name = ?", [number, name])
+        rows = self._store.rows(
+            "SELECT data FROM version_file WHERE version = ? AND name = ?", [number, name]
+        )
         data = bytes(rows[0]["data"]) if rows else b""
         expected, found = getattr(record, f"{name}_hash"), blake3(data)
         if found != expected:
@@ -304,7 +318,9 @@ class Campaign:
 
         return write_ase_db(path, self.atoms(**filters))
 
-    def candidate_rows(self, *, protocol: str | None = None, **filters: Any) -> tuple[CandidateReader, Iterator[Row]]:
+    def candidate_rows(
+        self, *, protocol: str | None = None, **filters: Any
+    ) -> tuple[CandidateReader, Iterator[Row]]:
         """Rows of candidates without their blocks, for tables."""
         reader = self._reader(protocol)
         return reader, reader.rows(_filter(filters))
@@ -318,10 +334,12 @@ class Campaign:
         if not rows:
             raise DamagedError(f"damaged database: the campaign has no {key}")
         checksums.CAMPAIGN.verify(rows[0])
-        return rows[0]["value"]
+        return str(rows[0]["value"])
 
     def _reader(self, protocol: str | None) -> CandidateReader:
-        return CandidateReader(self._store, self._seed_names, self._walk_conditions(), self._protocol(protocol))
+        return CandidateReader(
+            self._store, self._seed_names, self._walk_conditions(), self._protocol(protocol)
+        )
 
     def _protocol(self, name: str | None) -> LabelProtocol | None:
         """The protocol with this name, or the only one with labels; None without labels."""
@@ -335,7 +353,9 @@ class Campaign:
         labelled = [protocol for protocol in known if self._store.rows(sql, [protocol.number])]
         if len(labelled) > 1:
             names = ", ".join(f"'{protocol.name}'" for protocol in labelled)
-            raise StoreError(f"{self.location} has labels of several protocols: choose one of {names} with protocol=…")
+            raise StoreError(
+                f"{self.location} has labels of several protocols: choose one of {names} with protocol=…"
+            )
         return labelled[0] if labelled else None
 
     @cached_property
@@ -353,7 +373,9 @@ class Campaign:
             values = json.loads(row["conditions"])
             ramp = values.get("volume_ramp")
             values |= {"volume_ramp": ramp and tuple(ramp), "version": values.get("version", 0)}
-            found[row["walk"]] = WalkConditions(**{field.name: values[field.name] for field in fields(WalkConditions)})
+            found[row["walk"]] = WalkConditions(
+                **{field.name: values[field.name] for field in fields(WalkConditions)}
+            )
         return found
 
     def _has_versions(self) -> bool:

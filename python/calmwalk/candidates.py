@@ -76,7 +76,12 @@ class CandidateReader:
         conditions: Mapping[int, WalkConditions],
         protocol: LabelProtocol | None,
     ) -> None:
-        self._store, self._seed_names, self._conditions, self._protocol = store, seed_names, conditions, protocol
+        self._store, self._seed_names, self._conditions, self._protocol = (
+            store,
+            seed_names,
+            conditions,
+            protocol,
+        )
 
     def rows(self, wanted: CandidateFilter) -> Iterator[Row]:
         """Verified rows without blocks, in decision order, under the names `table__column`."""
@@ -121,7 +126,10 @@ class CandidateReader:
         conditions, parameters = ["1 = 1", *used], list(used.values())
         if wanted.labelled is not None:
             conditions.append(f"label.number IS {'NOT' if wanted.labelled else ''} NULL")
-        chosen = {"candidate.walk": _integers(wanted.walk), "seed_structure": self._seeds(wanted.seed_structure)}
+        chosen = {
+            "candidate.walk": _integers(wanted.walk),
+            "seed_structure": self._seeds(wanted.seed_structure),
+        }
         for column, numbers in chosen.items():
             if numbers is not None:
                 # An empty list matches nothing in both databases only in this form.
@@ -150,17 +158,22 @@ class CandidateReader:
         asked = {name: value for name, value in of_walk.items() if value is not None}
         conditions = self.walk_conditions(row)
         return not asked or (
-            conditions is not None and all(getattr(conditions, name) == value for name, value in asked.items())
+            conditions is not None
+            and all(getattr(conditions, name) == value for name, value in asked.items())
         )
 
     def _data(self, decisions: list[int], features: bool) -> dict[int, Row]:
         places = ", ".join("?" * len(decisions))
         columns = "decision, block, selector_grades, original_grades" + (", features" if features else "")
-        rows = self._store.rows(f"SELECT {columns} FROM candidate_data WHERE decision IN ({places})", decisions)
+        rows = self._store.rows(
+            f"SELECT {columns} FROM candidate_data WHERE decision IN ({places})", decisions
+        )
         found = {row["decision"]: row for row in rows}
         for decision in decisions:
             if decision not in found:
-                raise DamagedError(f"damaged database: candidate of decision {decision}: its block is missing")
+                raise DamagedError(
+                    f"damaged database: candidate of decision {decision}: its block is missing"
+                )
         return found
 
     def _candidate(self, row: Row, data: Row, features: bool) -> Candidate:

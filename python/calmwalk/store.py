@@ -62,7 +62,9 @@ def check_schema(found: int, where: str) -> None:
     """Raise :class:`SchemaError` unless this package reads tables of this version."""
     reads = f"this package reads versions {OLDEST_SCHEMA} to {NEWEST_SCHEMA}"
     if found > NEWEST_SCHEMA:
-        raise SchemaError(f"{where} has schema version {found}, and {reads}: install the package of a newer calmwalk")
+        raise SchemaError(
+            f"{where} has schema version {found}, and {reads}: install the package of a newer calmwalk"
+        )
     if found < OLDEST_SCHEMA:
         raise SchemaError(
             f"{where} has schema version {found}, and {reads}: any calmwalk command that writes brings the campaign up to "
@@ -111,7 +113,9 @@ class SqliteStore:
             raise SchemaError(f"{self._path} is not an SQLite database: it begins with {begin!r}")
 
     def _identify(self) -> int:
-        application, version = (self.rows(f"PRAGMA {name}")[0][0] for name in ("application_id", "user_version"))
+        application, version = (
+            self.rows(f"PRAGMA {name}")[0][name] for name in ("application_id", "user_version")
+        )
         if application != APPLICATION:
             raise SchemaError(
                 f"{self._path} is a database of another program: application id {application:#x}, expected {APPLICATION:#x}"
@@ -168,7 +172,9 @@ class PostgresStore:
             import psycopg
             from psycopg.rows import dict_row
         except ImportError:
-            raise MissingPackage("a campaign on a PostgreSQL server needs psycopg: pip install 'psycopg[binary]'") from None
+            raise MissingPackage(
+                "a campaign on a PostgreSQL server needs psycopg: pip install 'psycopg[binary]'"
+            ) from None
         self.location = _without_password(url)
         plain, schema = _without_schema(url)
         self._errors: type[Exception] = psycopg.Error
@@ -187,7 +193,7 @@ class PostgresStore:
     def rows(self, sql: str, parameters: Iterable[Any] = ()) -> list[Row]:
         try:
             cursor = self._connection.cursor(binary=True)
-            return cursor.execute(sql.replace("?", "%s"), list(parameters)).fetchall()
+            return list(cursor.execute(sql.replace("?", "%s"), list(parameters)).fetchall())
         except self._errors as error:
             raise StoreError(f"{self.location}: {str(error).strip()}") from error
 
@@ -195,9 +201,14 @@ class PostgresStore:
         self._connection.close()
 
     def _identify(self, schema: str) -> int:
-        tables = {row["tablename"] for row in self.rows("SELECT tablename FROM pg_tables WHERE schemaname = ?", [schema])}
+        tables = {
+            row["tablename"]
+            for row in self.rows("SELECT tablename FROM pg_tables WHERE schemaname = ?", [schema])
+        }
         if not tables - {"_sqlx_migrations"}:
-            raise MissingCampaign(f"there is no campaign in {self.location}: the schema '{schema}' has no tables")
+            raise MissingCampaign(
+                f"there is no campaign in {self.location}: the schema '{schema}' has no tables"
+            )
         if "leader" not in tables:
             raise SchemaError(
                 f"the schema in {self.location} has a table '{min(tables)}' of another program, expected those of a campaign"
@@ -229,5 +240,9 @@ def _without_schema(url: str) -> tuple[str, str]:
 def _without_password(url: str) -> str:
     parts = urlsplit(url)
     user, at, host = parts.netloc.rpartition("@")
-    parameters = [(key, value) for key, value in parse_qsl(parts.query, keep_blank_values=True) if key != "password"]
-    return urlunsplit(parts._replace(netloc=user.partition(":")[0] + at + host, query=urlencode(parameters, safe="/")))
+    parameters = [
+        (key, value) for key, value in parse_qsl(parts.query, keep_blank_values=True) if key != "password"
+    ]
+    return urlunsplit(
+        parts._replace(netloc=user.partition(":")[0] + at + host, query=urlencode(parameters, safe="/"))
+    )

@@ -30,7 +30,7 @@ class Table:
 
 def _columns(text: str) -> dict[str, str]:
     """Columns from a text such as ``walk:int origin:text``."""
-    return dict(tuple(column.split(":")) for column in text.split())  # type: ignore[arg-type]
+    return {name: kind for name, _, kind in (column.partition(":") for column in text.split())}
 
 
 _OF_WALK = "group:text walk_temperature:float walk_tau:float potential_version:int"

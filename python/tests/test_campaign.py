@@ -37,7 +37,9 @@ _OWN_INFO = {"decision", "fate", "reason", "model_energy", "model_virial"}
 _OWN_ARRAYS = {"model_forces", "forces"}
 
 
-@unittest.skipUnless(small_campaign.program(), "there is no calmwalk binary: build one, or set CALMWALK_BINARY")
+@unittest.skipUnless(
+    small_campaign.program(), "there is no calmwalk binary: build one, or set CALMWALK_BINARY"
+)
 @unittest.skipUnless(_has("ase"), "needs ase")
 class CampaignCase(unittest.TestCase):
     """Tests of one campaign, which is run once for each class and not changed."""
@@ -110,7 +112,10 @@ class ReadingTests(CampaignCase):
             squares = np.einsum("ni,ij,nj->n", delta, component.inverse, delta)
             gammas.append(np.sqrt(squares) / component.threshold)
             np.testing.assert_allclose(
-                np.linalg.inv(component.covariance + 1e-6 * np.eye(len(delta[0]))), component.inverse, rtol=1e-6, atol=1e-6
+                np.linalg.inv(component.covariance + 1e-6 * np.eye(len(delta[0]))),
+                component.inverse,
+                rtol=1e-6,
+                atol=1e-6,
             )
         found = np.min(gammas, axis=0).max()
         self.assertAlmostEqual(found, last.detail["update"]["gamma_max_after"], delta=1e-8)
@@ -234,7 +239,9 @@ def _in(condition, candidate: Candidate, everything: list[Candidate]) -> bool:
         return candidate.id in [other.id for other in everything[1:4]]
 
 
-@unittest.skipUnless(_POSTGRES and _has("psycopg"), "needs psycopg, and CALMWALK_POSTGRES=$(.ci/postgres start)")
+@unittest.skipUnless(
+    _POSTGRES and _has("psycopg"), "needs psycopg, and CALMWALK_POSTGRES=$(.ci/postgres start)"
+)
 class PostgresTests(ReadingTests):
     @classmethod
     def place(cls) -> str:
@@ -287,8 +294,14 @@ class DamageTests(CampaignCase):
 
     def test_other_schemas_are_refused_with_both_versions(self) -> None:
         for found, message in [
-            (NEWEST_SCHEMA + 1, f"schema version {NEWEST_SCHEMA + 1}, and this package reads versions .*newer calmwalk"),
-            (OLDEST_SCHEMA - 1, f"schema version {OLDEST_SCHEMA - 1}, and .* {OLDEST_SCHEMA} to {NEWEST_SCHEMA}: any"),
+            (
+                NEWEST_SCHEMA + 1,
+                f"schema version {NEWEST_SCHEMA + 1}, and this package reads versions .*newer calmwalk",
+            ),
+            (
+                OLDEST_SCHEMA - 1,
+                f"schema version {OLDEST_SCHEMA - 1}, and .* {OLDEST_SCHEMA} to {NEWEST_SCHEMA}: any",
+            ),
         ]:
             self.change(f"PRAGMA user_version = {found}")
             with self.assertRaisesRegex(SchemaError, message):
@@ -350,7 +363,9 @@ class DamageTests(CampaignCase):
         self.assertEqual(self.file.read_bytes(), before)
 
     def test_labels_of_several_protocols_must_be_chosen(self) -> None:
-        small_campaign.run("import", str(self.copy), str(self.directory / "imported.extxyz"), "--protocol", "other")
+        small_campaign.run(
+            "import", str(self.copy), str(self.directory / "imported.extxyz"), "--protocol", "other"
+        )
         with calmwalk.open(self.copy) as campaign:
             with self.assertRaisesRegex(StoreError, "labels of several protocols: choose one of .*'other'"):
                 list(campaign.dataset(imported=True))
@@ -378,7 +393,11 @@ class SourceTests(unittest.TestCase):
 
         text = (small_campaign.ROOT / "store" / "src" / "checksum.rs").read_text()
         found = re.findall(r'checked!\("(\w+)" by (\w+) \w+ \{([^}]*)\}\)', text)
-        tables = {table.name: table for table in vars(checksums).values() if isinstance(table, checksums.CheckedTable)}
+        tables = {
+            table.name: table
+            for table in vars(checksums).values()
+            if isinstance(table, checksums.CheckedTable)
+        }
         self.assertGreater(len(tables), 10)
         for name, key, columns in found:
             if name in tables:
@@ -393,7 +412,9 @@ class EncodingTests(unittest.TestCase):
         from calmwalk.blocks import decode_numbers
         from calmwalk.store_errors import MissingPackage
 
-        row = bytes([3, 0, 0, 0, 0, 0, 0, 0, 0x28, 0xB5, 0x2F, 0xFD, 0, 0x48, 0x75, 0, 0, 0x40, 0, 0, 0xF8, 0xD0, 8])
+        row = bytes(
+            [3, 0, 0, 0, 0, 0, 0, 0, 0x28, 0xB5, 0x2F, 0xFD, 0, 0x48, 0x75, 0, 0, 0x40, 0, 0, 0xF8, 0xD0, 8]
+        )
         row += bytes([0x3F, 0xBF, 0x40, 1, 0, 8, 0xC0, 2])
         try:
             self.assertEqual(list(decode_numbers(row)), [1.5, -0.25, 3.0])
