@@ -41,6 +41,7 @@ use crate::forgetting::ForgettingRule;
 use crate::output::count;
 use crate::progress::RunDisplay;
 pub use listen::Listen;
+pub use multi_process::shared_memory_needed;
 
 /// Capacity of the channel of reports from walkers to the reactor.
 const CHANNEL: usize = 64;

@@ -6,6 +6,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
+use calm::Mixture;
 use orchestrator::launcher::Children;
 use orchestrator::reactor;
 use orchestrator::selector::Selector;
@@ -24,6 +25,7 @@ use super::agent_service::AgentService;
 use super::label_order::CompletionModels;
 use super::process_manager::{self, ProcessManager};
 use super::{CHANNEL, ReactorTask, RunContext, spawn, start_reactor, wanted_walkers};
+use crate::campaign::LoadedCampaign;
 use crate::exit_status::CommandError;
 
 /// Time that the last writes to the database may take after all processes have ended.
@@ -48,6 +50,17 @@ pub async fn run(
     Ok(ended)
 }
 
+/// Shared memory for the messages and the mixture of a campaign when it starts, bytes.
+pub fn shared_memory_needed(campaign: &LoadedCampaign, mixture: &Mixture) -> Result<u64, CommandError> {
+    let mixture =
+        SharedMixture::space_needed(mixture, wanted_walkers(campaign)).map_err(CommandError::failed)?;
+    Ok(mixture + space_needed(&message_sizes(campaign)))
+}
+
+fn message_sizes(campaign: &LoadedCampaign) -> Sizes {
+    Sizes { walkers: wanted_walkers(campaign), message_bytes: campaign.largest_message() }
+}
+
 async fn run_in(
     place: &ShmDir,
     run: RunContext<'_>,
@@ -57,9 +70,8 @@ async fn run_in(
     let RunContext { campaign, store, process, .. } = run;
     let walkers = wanted_walkers(campaign);
     let mixture = Arc::clone(selector.mixture());
-    let sizes = Sizes { walkers, message_bytes: campaign.largest_message() };
-    let needed =
-        SharedMixture::space_needed(&mixture, walkers).map_err(CommandError::failed)? + space_needed(&sizes);
+    let sizes = message_sizes(campaign);
+    let needed = shared_memory_needed(campaign, &mixture)?;
     let _prepared = place.prepare(needed).map_err(CommandError::failed)?;
     let shared = SharedMixture::create(&place.mixture(), &mixture, walkers);
     let shared = shared.map_err(CommandError::failed)?;
