@@ -40,8 +40,8 @@ pub fn processor() -> MachineCheck {
 
 /// Name of the processor in the text of /proc/cpuinfo.
 fn processor_name(cpuinfo: &str) -> Option<&str> {
-    let value = |line: &str| line.split_once(':').map(|(_, value)| value.trim());
-    cpuinfo.lines().find(|line| line.starts_with("model name")).and_then(value)
+    let (_, value) = cpuinfo.lines().find(|line| line.starts_with("model name"))?.split_once(':')?;
+    Some(value.trim())
 }
 
 /// Shared memory; `needed` is what the campaign takes, bytes.
