@@ -15,8 +15,8 @@ use serde_json::json;
 use self::check::{MachineCheck, write_table};
 use self::requirements::Requirements;
 use super::{CommandError, ExitStatus, campaign_location};
-use crate::build_info;
 use crate::output::{count, print, print_json};
+use crate::{build_info, runtime};
 
 /// Check what this machine has for campaigns, and what is missing for which feature
 ///
@@ -67,7 +67,7 @@ impl DoctorArgs {
     /// All checks, in the order of the table.
     fn checks(&self, needs: Option<&Requirements>) -> Result<Vec<MachineCheck>, CommandError> {
         let mut checks = vec![machine::processor()];
-        let walkers = needs.map_or_else(machine::cores, |needs| needs.walkers().into());
+        let walkers = u64::from(needs.map_or_else(runtime::cores, Requirements::walkers));
         checks.push(machine::shared_memory(needs.and_then(Requirements::shared_memory)));
         checks.push(machine::open_files(walkers));
         checks.push(machine::processes(walkers));

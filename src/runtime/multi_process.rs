@@ -52,13 +52,13 @@ pub async fn run(
 
 /// Shared memory for the messages and the mixture of a campaign when it starts, bytes.
 pub fn shared_memory_needed(campaign: &LoadedCampaign, mixture: &Mixture) -> Result<u64, CommandError> {
-    let mixture =
-        SharedMixture::space_needed(mixture, wanted_walkers(campaign)).map_err(CommandError::failed)?;
+    let mixture = SharedMixture::space_needed(mixture, wanted_walkers(&campaign.config))
+        .map_err(CommandError::failed)?;
     Ok(mixture + space_needed(&message_sizes(campaign)))
 }
 
 fn message_sizes(campaign: &LoadedCampaign) -> Sizes {
-    Sizes { walkers: wanted_walkers(campaign), message_bytes: campaign.largest_message() }
+    Sizes { walkers: wanted_walkers(&campaign.config), message_bytes: campaign.largest_message() }
 }
 
 async fn run_in(
@@ -68,7 +68,7 @@ async fn run_in(
     completion: CompletionModels,
 ) -> Result<reactor::RunOutcome, CommandError> {
     let RunContext { campaign, store, process, .. } = run;
-    let walkers = wanted_walkers(campaign);
+    let walkers = wanted_walkers(&campaign.config);
     let mixture = Arc::clone(selector.mixture());
     let sizes = message_sizes(campaign);
     let needed = shared_memory_needed(campaign, &mixture)?;

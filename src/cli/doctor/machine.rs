@@ -1,6 +1,5 @@
 //! Processor, shared memory and limits of this machine.
 
-use std::num::NonZeroUsize;
 use std::path::Path;
 
 use potentials::grace::Instructions;
@@ -8,8 +7,8 @@ use rustix::fs::Access;
 use rustix::process::{Resource, getrlimit};
 
 use super::check::MachineCheck;
-use crate::build_info;
 use crate::wording::disk::megabytes;
+use crate::{build_info, runtime};
 
 const SHARED_MEMORY: &str = "/dev/shm";
 /// What a small campaign takes; containers have no more by default, bytes.
@@ -19,17 +18,12 @@ const FILES: (u64, u64) = (16, 256);
 /// Processes and threads: for each walker, and for everything else.
 const TASKS: (u64, u64) = (16, 64);
 
-/// Cores that this process may use.
-pub fn cores() -> u64 {
-    std::thread::available_parallelism().map_or(1, NonZeroUsize::get) as u64
-}
-
 /// The processor, and the instruction sets that the engine uses on it.
 pub fn processor() -> MachineCheck {
     const NEEDED_FOR: &str = "walks with native potentials, grades";
     let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = processor_name(&text).unwrap_or(std::env::consts::ARCH);
-    let found = format!("{} × {name}: {}", cores(), build_info::instructions());
+    let found = format!("{} × {name}: {}", runtime::cores(), build_info::instructions());
     if cfg!(target_arch = "x86_64") && Instructions::best().name() == "baseline" {
         let advice = "without AVX2 and FMA, products are emulated and walks take many times as long: use a processor from 2015 or later, or \
                       let the virtual machine pass its instructions on";

@@ -6,7 +6,6 @@ use toml::{Table, Value};
 use workers::labeller::BatchSystem;
 
 use super::check::MachineCheck;
-use super::machine;
 use crate::campaign::LoadedCampaign;
 use crate::cli::CommandError;
 use crate::config::Config;
@@ -40,10 +39,7 @@ impl Requirements {
 
     /// Number of walkers on this machine.
     pub fn walkers(&self) -> u32 {
-        match self.config.run.walkers {
-            0 => (machine::cores() as u32 / self.config.run.threads_per_walker.get() as u32).max(1),
-            wanted => wanted as u32,
-        }
+        runtime::wanted_walkers(&self.config)
     }
 
     /// Shared memory for the start of the campaign, bytes, if its files could be read.
