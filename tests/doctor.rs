@@ -40,7 +40,7 @@ fn a_campaign_has_what_it_needs_or_the_table_says_what_is_missing() {
     assert!(check(&found, "file system")["found"].as_str().unwrap().contains("local, writable"));
 
     let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
-    let method = "method = { command = { command = [\"no-such-program\"], version = \"1\" } }\nbatch_system = \"slurm\"";
+    let method = "method = { command = { command = [\"no-such-program\"], version = \"1\" } }";
     let lines = text.lines().map(|line| if line.starts_with("method = ") { method } else { line });
     fs::write(here.join("other.toml"), lines.collect::<Vec<_>>().join("\n")).unwrap();
     let output = calmwalk(here, ["doctor", "other.toml", "--python", "nowhere"]);

@@ -77,9 +77,7 @@ impl DoctorArgs {
                 .extend(directory::checks(&self.campaign_directory(), needs.and_then(Requirements::disk))),
         }
         let python = self.python.clone().or_else(|| needs.and_then(Requirements::python));
-        // Both name one that must be there.
-        let is_named = python.is_some();
-        checks.extend(python::checks(python.as_deref()).into_iter().map(|check| check.required_if(is_named)));
+        checks.extend(python::checks(python.as_deref()));
         checks.push(programs::device());
         checks.extend(programs::codes());
         let slurm = needs.is_some_and(Requirements::slurm);

@@ -8,7 +8,7 @@ use serde::Deserialize;
 use super::check::MachineCheck;
 use super::program;
 
-/// Distributions, and what each is needed for. The first is always needed.
+/// Distributions, and what each is needed for.
 const PACKAGES: [(&str, &str); 6] = [
     ("numpy", "every Python potential, calmwalk.open"),
     ("torch", "MACE and other models in PyTorch"),
@@ -37,8 +37,9 @@ struct PythonVersions {
 }
 
 /// The interpreter of an environment and its packages. Which packages a potential needs, its adapter tells: only the interpreter
-/// and numpy count as needed if the environment is.
+/// and numpy are required if an environment is named.
 pub fn checks(environment: Option<&Path>) -> Vec<MachineCheck> {
+    let required = environment.is_some();
     const NAME: &str = "Python";
     const NEEDED_FOR: &str = "Python potentials, calmwalk.open";
     let interpreter = match environment {
@@ -54,12 +55,16 @@ pub fn checks(environment: Option<&Path>) -> Vec<MachineCheck> {
             let text = format!("{}, {}", found.python, interpreter.display());
             let mut checks = vec![MachineCheck::present(NAME, text, NEEDED_FOR)];
             checks.extend(packages(&found, &interpreter));
-            checks
+            let require = |check: MachineCheck| {
+                let needed = required && check.name() == "numpy";
+                check.required_if(needed)
+            };
+            checks.into_iter().map(require).collect()
         }
         Err(error) => {
             let found = format!("{}: {error}", interpreter.display());
             let advice = "name a virtual environment, a conda prefix or an interpreter (--python, potential.environment)";
-            vec![MachineCheck::absent(NAME, found, NEEDED_FOR, advice)]
+            vec![MachineCheck::absent(NAME, found, NEEDED_FOR, advice).required_if(required)]
         }
     }
 }
@@ -76,7 +81,7 @@ fn versions(interpreter: &Path) -> Result<PythonVersions, String> {
     serde_json::from_str(&said).map_err(|_| format!("is no Python: it says {said:?}"))
 }
 
-/// numpy, and in one row each the frameworks that are there or not.
+/// The distributions that are there or not.
 fn packages(found: &PythonVersions, interpreter: &Path) -> Vec<MachineCheck> {
     let check = |(name, needed_for): &(&'static str, &'static str)| match found
         .packages
@@ -84,10 +89,10 @@ fn packages(found: &PythonVersions, interpreter: &Path) -> Vec<MachineCheck> {
         .cloned()
         .flatten()
     {
-        Some(version) => MachineCheck::present(format!("  {name}"), version, needed_for),
+        Some(version) => MachineCheck::present(name, version, needed_for),
         None => {
             let advice = format!("{} -m pip install {name}", interpreter.display());
-            MachineCheck::absent(format!("  {name}"), "not installed", needed_for, advice)
+            MachineCheck::absent(name, "not installed", needed_for, advice)
         }
     };
     PACKAGES.iter().map(check).collect()
@@ -124,8 +129,8 @@ mod tests {
         let found = checks(Some(Path::new("/bin/echo")));
         let json = serde_json::to_string(&found).unwrap();
         assert!(json.contains("is no Python"), "{json}");
-        assert!(found[0].clone().required_if(true).is_missing());
+        assert!(found[0].is_missing());
         let found = checks(Some(Path::new("/no/such/python")));
-        assert!(found[0].clone().required_if(true).is_missing() && found.len() == 1);
+        assert!(found[0].is_missing() && found.len() == 1);
     }
 }
