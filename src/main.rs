@@ -5,6 +5,7 @@
 mod all_cores;
 mod artifact_checks;
 mod atomic_file;
+mod build_info;
 mod calibration_file;
 mod calm_validation;
 mod campaign;

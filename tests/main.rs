@@ -18,6 +18,7 @@ mod cli_campaign;
 mod cli_md;
 mod configs;
 mod dashboard;
+mod doctor;
 mod energies;
 mod errors;
 mod exclude;

@@ -1,4 +1,4 @@
-"""calmwalk for Python: adapters that put a potential behind calmwalk's walkers.
+"""calmwalk for Python: adapters that put a potential behind calmwalk's walkers, and reading of campaigns.
 
 Names are imported when they are first used, so that the server can set the number of threads before numpy loads.
 """
@@ -20,7 +20,14 @@ _HOME = {
     "scatter": "batch",
 }
 
-__all__ = sorted(_HOME)
+__all__ = sorted([*_HOME, "open"])
+
+
+def open(location: Any) -> Any:
+    """Open a campaign for reading: see :func:`calmwalk.campaign.open_campaign`."""
+    from .campaign import open_campaign
+
+    return open_campaign(location)
 
 
 def __getattr__(name: str) -> Any:

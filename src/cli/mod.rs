@@ -7,6 +7,7 @@ mod calm;
 mod campaign_location;
 mod clean;
 mod dashboard;
+mod doctor;
 mod estimate;
 mod exclude;
 mod explain;
@@ -45,6 +46,7 @@ use std::path::PathBuf;
 use ::store::Location;
 use clap::{Parser, Subcommand};
 
+use crate::build_info;
 use crate::duration::Duration;
 use crate::exit_status::{CommandError, ExitStatus};
 
@@ -52,7 +54,7 @@ use crate::exit_status::{CommandError, ExitStatus};
 ///
 /// Exit codes: 0 success, 1 failure, 2 invalid input or configuration, 130 interrupted.
 #[derive(Debug, Parser)]
-#[command(name = "calmwalk", version, max_term_width = 100)]
+#[command(name = "calmwalk", version, long_version = build_info::long_version(), max_term_width = 100)]
 pub struct Arguments {
     #[command(subcommand)]
     command: CliCommand,
@@ -92,6 +94,7 @@ enum CliCommand {
     Import(import::ImportArgs),
     Store(store::StoreArgs),
     Md(md::MdArgs),
+    Doctor(doctor::DoctorArgs),
     Clean(clean::CleanArgs),
     #[command(hide = true)]
     Walker(walker::WalkerArgs),
@@ -136,6 +139,7 @@ pub fn run(arguments: Arguments) -> Result<ExitStatus, CommandError> {
         CliCommand::Import(command) => command.run(),
         CliCommand::Store(command) => command.run(),
         CliCommand::Md(command) => command.run(),
+        CliCommand::Doctor(command) => command.run(),
         CliCommand::Clean(command) => command.run(),
         CliCommand::Walker(command) => command.run(),
         CliCommand::Labeller(command) => command.run(),

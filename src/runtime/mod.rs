@@ -41,6 +41,7 @@ use crate::forgetting::ForgettingRule;
 use crate::output::count;
 use crate::progress::RunDisplay;
 pub use listen::Listen;
+pub use multi_process::shared_memory_needed;
 
 /// Capacity of the channel of reports from walkers to the reactor.
 const CHANNEL: usize = 64;
@@ -151,9 +152,9 @@ fn start_reactor(
 }
 
 /// Number of walkers to run in parallel, from the configuration.
-fn wanted_walkers(campaign: &LoadedCampaign) -> u32 {
-    match campaign.config.run.walkers {
-        0 => (cores() / campaign.config.run.threads_per_walker.get() as u32).max(1),
+pub fn wanted_walkers(config: &Config) -> u32 {
+    match config.run.walkers {
+        0 => (cores() / config.run.threads_per_walker.get() as u32).max(1),
         wanted => wanted as u32,
     }
 }
@@ -162,7 +163,7 @@ fn wanted_walkers(campaign: &LoadedCampaign) -> u32 {
 /// them. A control walk begins after its biased walk, so never more walks are under way than there are biased ones.
 pub fn idle_walkers(campaign: &LoadedCampaign) -> Option<String> {
     let Config { campaign: section, run, .. } = &campaign.config;
-    let walkers = wanted_walkers(campaign) as usize;
+    let walkers = wanted_walkers(&campaign.config) as usize;
     let biased: usize = campaign.seed_structures.iter().map(|named| named.plan.walks.len()).sum();
     let of_round = match section.mode {
         CampaignMode::Reproducible => {

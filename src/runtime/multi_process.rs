@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge::DeviceService;
+use calm::Mixture;
 use orchestrator::launcher::Children;
 use orchestrator::reactor;
 use orchestrator::selector::Selector;
@@ -25,6 +26,7 @@ use super::agent_service::AgentService;
 use super::label_order::CompletionModels;
 use super::process_manager::{self, ProcessManager};
 use super::{CHANNEL, ReactorTask, RunContext, spawn, start_reactor, wanted_walkers};
+use crate::campaign::LoadedCampaign;
 use crate::exit_status::CommandError;
 
 /// Time that the last writes to the database may take after all processes have ended.
@@ -49,6 +51,26 @@ pub async fn run(
     Ok(ended)
 }
 
+/// Shared memory for the messages and the mixture of a campaign when it starts, bytes.
+pub fn shared_memory_needed(campaign: &LoadedCampaign, mixture: &Mixture) -> Result<u64, CommandError> {
+    let mixture = SharedMixture::space_needed(mixture, wanted_walkers(&campaign.config))
+        .map_err(CommandError::failed)?;
+    let calls = match campaign.config.potential.python {
+        Some(_) => call_space_needed(wanted_walkers(&campaign.config), call_words(campaign)),
+        None => 0,
+    };
+    Ok(mixture + space_needed(&message_sizes(campaign)) + calls)
+}
+
+/// Size of the largest reply of a device: it has the features of all atoms, as a candidate has.
+fn call_words(campaign: &LoadedCampaign) -> usize {
+    campaign.largest_message() / 8
+}
+
+fn message_sizes(campaign: &LoadedCampaign) -> Sizes {
+    Sizes { walkers: wanted_walkers(&campaign.config), message_bytes: campaign.largest_message() }
+}
+
 async fn run_in(
     place: &ShmDir,
     run: RunContext<'_>,
@@ -56,15 +78,12 @@ async fn run_in(
     completion: CompletionModels,
 ) -> Result<reactor::RunOutcome, CommandError> {
     let RunContext { campaign, store, process, .. } = run;
-    let walkers = wanted_walkers(campaign);
+    let walkers = wanted_walkers(&campaign.config);
     let mixture = Arc::clone(selector.mixture());
-    let sizes = Sizes { walkers, message_bytes: campaign.largest_message() };
-    let needed =
-        SharedMixture::space_needed(&mixture, walkers).map_err(CommandError::failed)? + space_needed(&sizes);
+    let sizes = message_sizes(campaign);
+    let needed = shared_memory_needed(campaign, &mixture)?;
     let device = campaign.model.device();
-    // A reply has the features of all atoms, as a candidate has.
-    let words = campaign.largest_message() / 8;
-    let needed = needed + device.map_or(0, |_| call_space_needed(walkers, words));
+    let words = call_words(campaign);
     let _prepared = place.prepare(needed).map_err(CommandError::failed)?;
     let shared = SharedMixture::create(&place.mixture(), &mixture, walkers);
     let shared = shared.map_err(CommandError::failed)?;

@@ -159,7 +159,7 @@ fn start_walkers(
             .spawn(move || walker::run(&context, &mut transport))
             .map_err(|error| CommandError::Failed(format!("cannot start walker {number}: {error}")))
     };
-    (0..wanted_walkers(campaign)).map(start).collect()
+    (0..wanted_walkers(&campaign.config)).map(start).collect()
 }
 
 fn start_labellers(

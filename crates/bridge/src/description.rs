@@ -21,7 +21,7 @@ pub struct ModelDescription {
     pub device: String,
     /// Chemical symbols, in the order of the element indices.
     pub elements: Vec<String>,
-    /// Cutoff by pair of element indices, Å.
+    /// Cutoff by pair of element indices, Å; 0 for a model that needs no bonds.
     pub cutoffs: Vec<Vec<f64>>,
     /// The features.
     pub features: RawFeatures,
@@ -85,9 +85,9 @@ impl ModelDescription {
             return Err(format!("cutoffs: not a row and a column for each of {count} elements"));
         }
         if let Some(wrong) =
-            self.cutoffs.iter().flatten().find(|cutoff| !(cutoff.is_finite() && **cutoff > 0.0))
+            self.cutoffs.iter().flatten().find(|cutoff| !(cutoff.is_finite() && **cutoff >= 0.0))
         {
-            return Err(format!("cutoffs: {wrong}; expected a positive number of Å"));
+            return Err(format!("cutoffs: {wrong}; expected a number of Å"));
         }
         let RawFeatures { form, dimension, blocks } = &self.features;
         let columns: usize = blocks.iter().sum();

@@ -46,7 +46,8 @@ impl ServerProcess {
         let program = settings.program();
         let mut words = settings.launcher.iter().map(std::ffi::OsStr::new).chain([program.as_os_str()]);
         let mut command = Command::new(words.next().unwrap_or_default());
-        command.args(words).args(["-m", "calmwalk.server"]);
+        // Modules of the working directory would come before those of the environment.
+        command.args(words).args(["-m", "calmwalk.server"]).current_dir(package);
         let path = match std::env::var_os("PYTHONPATH").filter(|path| !path.is_empty()) {
             None => package.as_os_str().to_owned(),
             Some(others) => {

@@ -124,7 +124,7 @@ impl AbinitSettings {
 }
 
 /// The version, such as `9.6.2`.
-fn version(
+pub(crate) fn version(
     command: &[String],
     environment: &BTreeMap<String, String>,
     passed: &PassedEnvironment,

@@ -132,7 +132,7 @@ impl Cp2kSettings {
 }
 
 /// The version, such as `2023.1`.
-fn version(
+pub(crate) fn version(
     command: &[String],
     environment: &BTreeMap<String, String>,
     passed: &PassedEnvironment,

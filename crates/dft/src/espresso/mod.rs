@@ -133,7 +133,7 @@ impl EspressoSettings {
 }
 
 /// The version, such as `6.7MaX`. Without input, `pw.x` prints it and fails.
-fn version(
+pub(crate) fn version(
     command: &[String],
     environment: &BTreeMap<String, String>,
     passed: &PassedEnvironment,

@@ -49,6 +49,17 @@ impl Instructions {
         sets.into_iter().map(Self).collect()
     }
 
+    /// `"AVX-512"`, `"AVX2 with FMA"` or `"baseline"`.
+    pub fn name(self) -> &'static str {
+        match self.0 {
+            #[cfg(target_arch = "x86_64")]
+            InstructionSet::Avx512 => "AVX-512",
+            #[cfg(target_arch = "x86_64")]
+            InstructionSet::Avx2 => "AVX2 with FMA",
+            InstructionSet::Baseline => "baseline",
+        }
+    }
+
     /// Runs a pass, compiled for these instructions.
     #[allow(unsafe_code)] // The processor has them: `best` has asked.
     pub(crate) fn run(self, pass: impl SimdPass) {
