@@ -3,7 +3,7 @@
 //! The model knows labels of one protocol, of structures from walks with one version of the potential: grades of different
 //! versions cannot be compared.
 
-use analysis::{LogisticModel, ReliabilityDiagram};
+use analysis::{ReliabilityDiagram, logistic_regression};
 use serde::Serialize;
 use store::{FinishedStructure, Store, StoreError};
 use wire::{CompletionCoefficients, CompletionPredictors, ContentHash};
@@ -17,7 +17,7 @@ pub const MIN_FINISHED: usize = 20;
 /// See [`MIN_FINISHED`].
 pub const MIN_OF_EACH: usize = 3;
 
-/// λ of [`LogisticModel`]: as if each coefficient were known to be 0 ± 1 for predictors with a standard deviation of 1.
+/// λ of [`logistic_regression`]: as if each coefficient were known to be 0 ± 1 for predictors with a standard deviation of 1.
 const RIDGE_PENALTY: f64 = 1.0;
 
 /// Parts into which finished structures are divided to judge the model: each is predicted by a model of the others.
@@ -74,8 +74,9 @@ fn regression(examples: &[CompletionExample]) -> Option<CompletionCoefficients> 
     elements.dedup();
     let rows: Vec<_> = examples.iter().map(|example| example.predictors.row(&elements)).collect();
     let outcomes: Vec<_> = examples.iter().map(|example| example.completed).collect();
-    let model = LogisticModel::fit(&rows, &outcomes, RIDGE_PENALTY)?;
-    Some(CompletionCoefficients { elements, intercept: model.intercept(), weights: model.weights().to_vec() })
+    let coefficients = logistic_regression(&rows, &outcomes, RIDGE_PENALTY)?;
+    let (intercept, weights) = coefficients.split_first()?;
+    Some(CompletionCoefficients { elements, intercept: *intercept, weights: weights.to_vec() })
 }
 
 /// How reliable the model is: predictions of finished structures by models that were learned from others.

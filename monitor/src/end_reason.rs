@@ -2,9 +2,10 @@
 
 use serde::Serialize;
 use serde_json::Value;
-use store::{CampaignStatus, Store, StoreError, VersionRecord};
+use store::{CampaignStatus, Store, StoreError};
 
-use crate::improvement::{Improvement, trained_versions};
+use crate::improvement::trained_versions;
+use crate::refit_progress::{RefitProgress, RefitRules};
 
 /// Why a campaign ended.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -42,25 +43,25 @@ impl CampaignEnd {
         if !status.finished {
             return Ok(None);
         }
-        let configuration = store.campaign().await?.configuration_in_force;
-        let configuration = serde_json::from_str(&configuration).unwrap_or_default();
-        Ok(Self::find(status, &configuration, &store.versions().await?))
+        let configuration = configuration_in_force(store).await?;
+        let progress = RefitProgress::read(store, RefitRules::from_json(&configuration)).await?;
+        Ok(Self::find(status, &configuration, &progress))
     }
 
     /// Why a campaign with this configuration ended. `None` if it is not finished, or a version of the potential is left to train.
-    pub fn find(status: &CampaignStatus, configuration: &Value, versions: &[VersionRecord]) -> Option<Self> {
+    pub fn find(status: &CampaignStatus, configuration: &Value, progress: &RefitProgress) -> Option<Self> {
         if !status.finished {
             return None;
         }
         // A budget of time allows no refit either; one of structures does.
         let may_refit = status.budget.limits.time_used_up(&status.budget.used).is_none();
-        if may_refit && is_refit_left(configuration, versions, status.candidates.accepted) {
+        if may_refit && progress.is_refit_left() {
             return None;
         }
         if let Some(key) = &status.budget.used_up {
             return Some(Self::Budget { key: key.clone() });
         }
-        if let Some(found) = small_improvement(configuration, versions) {
+        if let Some(found) = progress.small_improvement() {
             let improvement = found.per_100_labels();
             return Some(Self::SmallImprovement { version: found.version, improvement });
         }
@@ -68,40 +69,21 @@ impl CampaignEnd {
             let steps = configuration["stop"]["max_steps_without_structure"].as_u64();
             return Some(Self::NothingNew { steps });
         }
-        let trained = trained_versions(versions).count() as u64;
-        let all = max_versions(configuration).filter(|most| trained >= *most);
-        Some(all.map_or(Self::AllWalks, |_| Self::AllVersions { versions: trained }))
+        let is_last = progress.rules.max_versions > 0 && progress.are_all_trained();
+        let versions = trained_versions(&progress.versions).count() as u64;
+        Some(if is_last { Self::AllVersions { versions } } else { Self::AllWalks })
     }
 }
 
 /// Whether a version of the potential is left to train when all walks have ended, after which walks go on.
 pub async fn is_refit_due(store: &Store) -> Result<bool, StoreError> {
+    let rules = RefitRules::from_json(&configuration_in_force(store).await?);
+    Ok(rules.max_versions > 0 && RefitProgress::read(store, rules).await?.is_refit_left())
+}
+
+async fn configuration_in_force(store: &Store) -> Result<Value, StoreError> {
     let configuration = store.campaign().await?.configuration_in_force;
-    let configuration = serde_json::from_str(&configuration).unwrap_or_default();
-    if max_versions(&configuration).is_none() {
-        return Ok(false);
-    }
-    let accepted = store.accepted_structures().await?;
-    Ok(is_refit_left(&configuration, &store.versions().await?, accepted))
-}
-
-fn is_refit_left(configuration: &Value, versions: &[VersionRecord], accepted: u64) -> bool {
-    let trained = trained_versions(versions).count() as u64;
-    let before = versions.iter().map(|version| version.structures).max().unwrap_or(0);
-    max_versions(configuration).is_some_and(|most| trained < most)
-        && accepted > before
-        && small_improvement(configuration, versions).is_none()
-}
-
-/// `refit.max_versions`; `None` without a refit.
-fn max_versions(configuration: &Value) -> Option<u64> {
-    configuration["refit"]["max_versions"].as_u64()
-}
-
-/// The improvement of the newest version if it is below `stop.min_improvement`.
-fn small_improvement(configuration: &Value, versions: &[VersionRecord]) -> Option<Improvement> {
-    let least = configuration["stop"]["min_improvement"].as_f64()?;
-    Improvement::of_newest(versions).filter(|found| found.per_100_labels() < least)
+    Ok(serde_json::from_str(&configuration).unwrap_or_default())
 }
 
 /// Whether biased walks of the newest version of the potential ended because they found nothing new.
@@ -115,13 +97,13 @@ fn found_nothing_new(status: &CampaignStatus) -> bool {
 #[cfg(test)]
 mod tests {
     use serde_json::json;
-    use store::{Budget, BudgetStatus, Candidates, WalkStatus};
+    use store::{Budget, BudgetStatus, VersionRecord, WalkStatus};
     use wire::WalkConditions;
 
     use super::*;
     use crate::improvement::tests::version;
 
-    /// A finished campaign with these ends of biased walks, each with the version of the potential, and 200 accepted structures.
+    /// A finished campaign with these ends of biased walks, each with the version of the potential.
     fn finished(ends: &[(&str, u32)]) -> CampaignStatus {
         let walk = |(state, version): &(&str, u32)| WalkStatus {
             origin: "biased".into(),
@@ -129,39 +111,42 @@ mod tests {
             conditions: Some(WalkConditions { version: *version, ..WalkConditions::default() }),
             ..WalkStatus::default()
         };
-        CampaignStatus {
-            finished: true,
-            walks: ends.iter().map(walk).collect(),
-            candidates: Candidates { accepted: 200, ..Candidates::default() },
-            ..CampaignStatus::default()
-        }
+        CampaignStatus { finished: true, walks: ends.iter().map(walk).collect(), ..CampaignStatus::default() }
     }
 
     #[test]
     fn a_campaign_without_versions_ends_by_its_walks() {
         let status = finished(&[("completed", 0), ("diverged", 0)]);
-        assert_eq!(CampaignEnd::find(&status, &json!({}), &[]), Some(CampaignEnd::AllWalks));
+        assert_eq!(
+            CampaignEnd::find(&status, &json!({}), &RefitProgress::default()),
+            Some(CampaignEnd::AllWalks)
+        );
         let status = finished(&[("completed", 0), ("nothing_new", 0)]);
         let configuration =
             json!({ "stop": { "max_steps_without_structure": 500, "min_improvement": null } });
         let nothing_new = CampaignEnd::NothingNew { steps: Some(500) };
-        assert_eq!(CampaignEnd::find(&status, &configuration, &[]), Some(nothing_new));
+        assert_eq!(CampaignEnd::find(&status, &configuration, &RefitProgress::default()), Some(nothing_new));
         let budget = BudgetStatus { used_up: Some("budget.labels".into()), ..BudgetStatus::default() };
         let used_up = CampaignStatus { budget, ..status.clone() };
-        let end = CampaignEnd::find(&used_up, &configuration, &[]).unwrap();
+        let end = CampaignEnd::find(&used_up, &configuration, &RefitProgress::default()).unwrap();
         assert_eq!(json!(end), json!({ "kind": "budget", "key": "budget.labels" }));
         let unfinished = CampaignStatus { finished: false, ..used_up };
-        assert_eq!(CampaignEnd::find(&unfinished, &configuration, &[]), None);
+        assert_eq!(CampaignEnd::find(&unfinished, &configuration, &RefitProgress::default()), None);
     }
 
     #[test]
     fn a_campaign_with_versions_ends_with_the_last() {
-        let configuration = |least: Option<f64>, most: u32| json!({ "stop": { "min_improvement": least }, "refit": { "max_versions": most } });
         let first = version(1, 100, "held_out", [1.0, 0.5]);
         let versions = [first, version(2, 200, "held_out", [0.5, 0.48])];
         let status = finished(&[("nothing_new", 0), ("superseded", 1), ("completed", 2)]);
+        let progress = |least, most, versions: &[VersionRecord]| RefitProgress {
+            rules: RefitRules { min_improvement: least, max_versions: most, ..RefitRules::default() },
+            versions: versions.to_vec(),
+            accepted: 200,
+            labels_came_late: false,
+        };
         let found = |least, most, versions: &[VersionRecord]| {
-            CampaignEnd::find(&status, &configuration(least, most), versions)
+            CampaignEnd::find(&status, &json!({}), &progress(least, most, versions))
         };
         assert_eq!(found(None, 2, &versions), Some(CampaignEnd::AllVersions { versions: 2 }));
         assert_eq!(
@@ -173,7 +158,7 @@ mod tests {
         let used_up = |limits| {
             let budget = BudgetStatus { used_up: Some("budget.x".into()), limits, ..BudgetStatus::default() };
             let status = CampaignStatus { budget, ..status.clone() };
-            CampaignEnd::find(&status, &configuration(None, 3), &versions[..1])
+            CampaignEnd::find(&status, &json!({}), &progress(None, 3, &versions[..1]))
         };
         assert_eq!(used_up(Budget::default()), None, "another version follows a budget of structures");
         let no_time = Budget { wall_hours: Some(0.0), ..Budget::default() };

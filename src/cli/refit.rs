@@ -110,7 +110,7 @@ impl RefitArgs {
         }
         check_is_alone(store).await?;
         let schedule = RefitSchedule::read(store, &campaign.config).await?;
-        if !schedule.has_news() {
+        if !schedule.progress.has_news() {
             return Ok(None);
         }
         let directory = directory(location, known.as_ref())?;

@@ -20,6 +20,7 @@ use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 
 use atoms::extxyz::write_frame;
+use monitor::refit_progress::NO_LABELS;
 use potentials::grace::{GraceModel, Threads};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -47,8 +48,6 @@ const LOCK: &str = "refit.lock";
 /// The new model and its mixture.
 const MODEL: &str = command::MODEL;
 const MIXTURE: &str = "mixture.npz";
-/// Why a refit without any label to train on is refused.
-const NO_LABELS: &str = "there are no labels to train on";
 /// Name of the comparison with control frames.
 const CONTROL: &str = "control";
 

@@ -7,10 +7,11 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use atoms::extxyz::{ExtxyzWriteError, LabelKeys, write_frame};
+use monitor::refit_progress::{LabelPurpose, LabelSplit};
 use serde::{Deserialize, Serialize};
-use store::{ExportCursor, ExportFilter, ExportRow, ExportSource, Store, StoreError};
+use store::{ExportCursor, ExportFilter, ExportRow, Store};
 use tokio_util::sync::CancellationToken;
-use wire::{Origin, WalkConditions, WalkId};
+use wire::{WalkConditions, WalkId};
 
 use super::settings::RefitSettings;
 use crate::atomic_file::{AtomicFile, cannot_write};
@@ -84,62 +85,31 @@ impl LabelFiles {
     }
 }
 
-/// Whether the labels of a seed structure are never trained on: a share of all seed structures, for the whole campaign.
-pub fn is_held_out(seed_structure: &str, rng_seed: u64, share: f64) -> bool {
-    let mut hasher = blake3::Hasher::new();
-    hasher.update(b"calmwalk held out 1");
-    hasher.update(&rng_seed.to_le_bytes());
-    hasher.update(seed_structure.as_bytes());
-    let [a, b, c, d, e, f, g, h, ..] = *hasher.finalize().as_bytes();
-    let number = u64::from_le_bytes([a, b, c, d, e, f, g, h]) >> 11;
-    (number as f64) / ((1_u64 << 53) as f64) < share
-}
-
-/// Whether the campaign has any label that a refit trains on now. Reads labels until it finds one.
-pub async fn has_label_to_train_on(
-    store: &Store,
-    (held_out, control_frames): (f64, ControlFrames),
-    rng_seed: u64,
-) -> Result<bool, StoreError> {
-    let Some(protocol) = store.protocol_in_force().await? else { return Ok(false) };
-    let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: true };
-    let sorter = Sorter { held_out, control_frames, rng_seed, last_decision: i64::MAX };
-    let mut last = None;
-    loop {
-        let page = store.labelled(&filter, last, PAGE).await?;
-        let Some(end) = page.last() else { return Ok(false) };
-        last = Some(end.cursor);
-        if page.iter().any(|row| sorter.file(row, false) == Some(LabelFile::Training)) {
-            return Ok(true);
-        }
-    }
-}
-
 /// Where each label belongs.
 struct Sorter {
-    held_out: f64,
-    control_frames: ControlFrames,
-    rng_seed: u64,
+    split: LabelSplit,
     last_decision: i64,
 }
 
 impl Sorter {
     /// The file of a row. `after`: labels after the last decision, otherwise those before.
     fn file(&self, row: &ExportRow, after: bool) -> Option<LabelFile> {
-        let ExportSource::Candidate { seed_structure_name, origin, .. } = &row.source else {
-            return (!after).then_some(LabelFile::Training);
-        };
         let is_after =
             matches!(row.cursor, ExportCursor::Candidate(decision) if decision > self.last_decision);
-        let is_held_out = is_held_out(seed_structure_name, self.rng_seed, self.held_out);
         match (is_after, after) {
             (true, true) => Some(LabelFile::Since),
-            (false, false) if is_held_out => Some(LabelFile::HeldOut),
-            (false, false) if *origin == Origin::Control && self.control_frames == ControlFrames::Compare => {
-                Some(LabelFile::Control)
-            }
-            (false, false) => Some(LabelFile::Training),
+            (false, false) => Some(self.split.purpose(row).into()),
             _ => None,
+        }
+    }
+}
+
+impl From<LabelPurpose> for LabelFile {
+    fn from(purpose: LabelPurpose) -> Self {
+        match purpose {
+            LabelPurpose::Training => Self::Training,
+            LabelPurpose::HeldOut => Self::HeldOut,
+            LabelPurpose::Control => Self::Control,
         }
     }
 }
@@ -158,8 +128,9 @@ pub async fn write(
     let mut found = LabelFiles::default();
     let Some(protocol) = store.protocol_in_force().await? else { return Ok(Some(found)) };
     let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: true };
-    let RefitSettings { held_out, control_frames, .. } = *settings;
-    let sorter = Sorter { held_out, control_frames, rng_seed, last_decision: set.last_decision };
+    let compares_controls = settings.control_frames == ControlFrames::Compare;
+    let split = LabelSplit { held_out: settings.held_out, compares_controls, rng_seed };
+    let sorter = Sorter { split, last_decision: set.last_decision };
     let (campaign, conditions) = (store.campaign().await?.id.to_string(), store.walk_conditions().await?);
     let mut files = BTreeMap::new();
     let mut last = None;
@@ -228,22 +199,5 @@ fn read_kept<T: for<'a> Deserialize<'a>>(path: &Path) -> Result<Option<T>, Comma
         }),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
         Err(error) => Err(CommandError::Failed(format!("cannot read {}: {error}", path.display()))),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn about_the_share_of_the_seed_structures_is_held_out_for_good() {
-        let names: Vec<String> = (0..2000).map(|number| format!("seed {number}")).collect();
-        let held_out = |seed, share| names.iter().filter(|name| is_held_out(name, seed, share)).count();
-        // Five standard deviations of a binomial distribution.
-        assert!((held_out(1, 0.1) as f64 - 200.0).abs() < 5.0 * 180_f64.sqrt(), "{}", held_out(1, 0.1));
-        assert_eq!((held_out(1, 0.0), held_out(1, 1.0)), (0, 2000));
-        // A larger share holds out the same and others; another random seed others.
-        assert!(names.iter().all(|name| is_held_out(name, 1, 0.3) || !is_held_out(name, 1, 0.1)));
-        assert!(names.iter().any(|name| is_held_out(name, 1, 0.1) && !is_held_out(name, 2, 0.1)));
     }
 }

@@ -81,7 +81,7 @@ async fn run_version(
     if is_newer {
         // A version that the user went back to makes the refit beside the walks pointless.
         process.stop().await?;
-    } else if process.is_running() || schedule.is_due_after_walks() {
+    } else if process.is_running() || schedule.progress.is_refit_left() {
         tokio::select! {
             ended = process.run_to_end() => ended?,
             never = write_heartbeats(run.store.clone(), run.process.clone()) => match never {},

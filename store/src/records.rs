@@ -329,6 +329,8 @@ pub struct Lease {
     pub failed_calculations: Vec<String>,
     /// The job was requeued by hand: guards let it pass.
     pub overruled: bool,
+    /// The queue chose it by value ([`crate::Store::set_label_values`]).
+    pub ordered_by_value: bool,
     /// The structure to label.
     pub structure: Structure,
     /// Name of its candidate.

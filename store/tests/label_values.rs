@@ -88,6 +88,27 @@ async fn labels_tell_whether_their_structures_were_chosen_by_value() {
     assert_eq!(store.queue_show(&names[1]).await.unwrap().job.value, None);
 }
 
+/// The value of a job may come, and go, while a labeller that lost its lease still works on it.
+#[tokio::test]
+async fn a_label_tells_how_its_own_lease_was_chosen() {
+    let database = TestDatabase::new();
+    let store = database.create().await;
+    let names = accept(&store, 2).await;
+    set(&store, &[(&names[0], 1.0)]).await;
+    let by_value = lease(&store, 0).await;
+    assert_eq!((&by_value.candidate, by_value.ordered_by_value), (&names[0], true));
+    let in_order = lease(&store, 0).await;
+    assert_eq!((&in_order.candidate, in_order.ordered_by_value), (&names[1], false));
+    store.release_all("a", 1).await.unwrap();
+    assert_eq!(store.clear_label_values().await.unwrap(), 1);
+    assert_eq!(set(&store, &[(&names[1], 1.0)]).await, 1);
+    for (lease, expected) in [(&by_value, true), (&in_order, false)] {
+        store.complete(lease, &label(-1.0), 2).await.unwrap();
+        let labels = store.labels_of(ContentHash::from_structure(&lease.structure)).await.unwrap();
+        assert_eq!(labels[0].record.label.details.ordered_by_value, expected, "{}", lease.candidate);
+    }
+}
+
 #[tokio::test]
 async fn values_are_computed_from_finished_and_queued_structures() {
     let database = TestDatabase::new();

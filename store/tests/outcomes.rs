@@ -1,8 +1,8 @@
 //! Results of label jobs, as the cost model, `status` and the table of force errors read them.
 
 use store::{
-    Commit, ExportFilter, FailureCount, Fate, FateCount, JobState, LabelUsage, Lease, PendingJobs,
-    RelabelRequest, Store, Unlabelled, ValueRange, WalkRecord,
+    ArrivalSum, Commit, ExportFilter, FailureCount, Fate, FateCount, JobState, LabelUsage, Lease,
+    PendingJobs, RelabelRequest, Store, Unlabelled, ValueRange, WalkRecord,
 };
 use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
@@ -140,14 +140,21 @@ async fn labels_are_read_in_the_order_in_which_they_came() {
         store.complete(lease, &label(energy), 1000).await.unwrap();
     }
     let (dft, mut after, mut found) = (protocol("dft").hash, None, Vec::new());
+    let mut sum = ArrivalSum::default();
     loop {
+        assert_eq!(store.label_arrivals_until(dft, after).await.unwrap(), sum, "of what was read");
         let page = store.label_arrivals(dft, after, 1).await.unwrap();
         let Some(arrival) = page.first() else { break };
         after = Some((arrival.number, arrival.decision));
+        sum.add(arrival);
         found.push((arrival.row.label.energy, arrival.decision));
     }
     assert_eq!(found, [(-3.0, 3), (-2.0, 2), (-2.0, 4), (-1.0, 1)]);
     assert_eq!(store.label_arrivals(dft, None, 10).await.unwrap().len(), 4);
+    store.exclude(&[leases[1].candidate.clone()], "bad", 2000).await.unwrap();
+    assert_ne!(store.label_arrivals_until(dft, after).await.unwrap(), sum, "a label is gone");
+    store.include(&[leases[1].candidate.clone()], 3000).await.unwrap();
+    assert_eq!(store.label_arrivals_until(dft, after).await.unwrap(), sum);
 }
 
 #[tokio::test]

@@ -28,8 +28,22 @@ impl<T> GroupSample<T> {
         }
         self.kept.push((level, item));
         while self.kept.len() > self.room && self.least <= u64::BITS {
-            self.least += 1;
-            self.kept.retain(|(level, _)| *level >= self.least);
+            self.thin(self.least + 1);
+        }
+    }
+
+    /// Keeps of both samples the groups that each of them keeps by itself, so that ratios of their items stay right. Call it after each
+    /// item of either.
+    pub fn thin_together<U>(&mut self, other: &mut GroupSample<U>) {
+        let least = self.least.max(other.least);
+        self.thin(least);
+        other.thin(least);
+    }
+
+    fn thin(&mut self, least: u32) {
+        if least > self.least {
+            self.least = least;
+            self.kept.retain(|(level, _)| *level >= least);
         }
     }
 
@@ -67,6 +81,24 @@ mod tests {
         // A sample without preference has numbers with the mean 1000 ± 5 · 577 / √n.
         let mean = counts.keys().sum::<u64>() as f64 / counts.len() as f64;
         assert!((mean - 1000.0).abs() < 5.0 * 577.0 / (counts.len() as f64).sqrt(), "{mean}");
+    }
+
+    /// Of two samples of the same groups, one with many items of each, the other with few.
+    #[test]
+    fn samples_that_are_thinned_together_keep_the_same_groups() {
+        let (mut many, mut few) = (GroupSample::new(800), GroupSample::new(800));
+        for group in 0..1000_u64 {
+            for item in 0..4 {
+                many.add(group, (group, item));
+                many.thin_together(&mut few);
+            }
+            few.add(group, group);
+            few.thin_together(&mut many);
+        }
+        assert_eq!((many.total(), few.total()), (4000, 1000));
+        assert!(many.items().len() <= 800 && many.items().len() > 200);
+        let groups = many.items().filter(|(_, item)| *item == 0).map(|(group, _)| group);
+        assert!(groups.eq(few.items()), "four items for each of the other sample");
     }
 
     #[test]

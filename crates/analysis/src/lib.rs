@@ -47,7 +47,7 @@ pub use exceedance::Exceedance;
 pub use filtering::{FilterStep, GradedRow, Quality, filter_sweep};
 pub use group_sample::GroupSample;
 pub use histogram::{Histogram, decade_edges, linear_edges, logarithmic_edges};
-pub use logistic::LogisticModel;
+pub use logistic::logistic_regression;
 pub use offsets::{ElementOffset, EnergyOffsets, LabelledEnergy, TooFewLabels};
 pub use principal::PrincipalAxes;
 pub use quantiles::quantile;

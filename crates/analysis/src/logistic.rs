@@ -7,7 +7,7 @@ const MAX_HALVINGS: usize = 40;
 /// Converged when no coefficient changes by more.
 const TOLERANCE: f64 = 1e-10;
 
-/// The probability p of an event as a function of predictors **x**,
+/// The coefficients b, w₁, w₂ … of the probability p of an event as a function of predictors **x**, each per unit of its predictor,
 ///
 /// ln(p / (1 − p)) = b + Σₖ wₖ xₖ.
 ///
@@ -15,59 +15,38 @@ const TOLERANCE: f64 = 1e-10;
 /// penalty does not depend on units; b is not penalised. The minimum is unique and finite for λ > 0 if both outcomes
 /// occur, also where a predictor separates them (Hastie, Tibshirani and Friedman, *The Elements of Statistical Learning*,
 /// 2nd ed., sections 4.4.1 and 18.4).
-#[derive(Clone, Debug, PartialEq)]
-pub struct LogisticModel {
-    intercept: f64,
-    weights: Vec<f64>,
-}
-
-impl LogisticModel {
-    /// Fits the model to `rows` of predictors, each with whether the event happened. A predictor without spread has the
-    /// weight 0. `None` unless both outcomes occur, all rows are equally long and all numbers are finite, and `penalty` λ
-    /// is above 0.
-    pub fn fit(rows: &[Vec<f64>], outcomes: &[bool], penalty: f64) -> Option<Self> {
-        let columns = rows.first()?.len();
-        let is_usable = |row: &Vec<f64>| row.len() == columns && row.iter().all(|x| x.is_finite());
-        let happened = outcomes.iter().filter(|outcome| **outcome).count();
-        let both = happened > 0 && happened < outcomes.len();
-        if rows.len() != outcomes.len()
-            || !both
-            || !rows.iter().all(is_usable)
-            || penalty.is_nan()
-            || penalty <= 0.0
-        {
-            return None;
-        }
-        let scales: Vec<Scale> = (0..columns).map(|k| Scale::of(rows.iter().map(|row| row[k]))).collect();
-        let standard = |row: &Vec<f64>| {
-            let scaled = row.iter().zip(&scales).map(|(x, scale)| scale.apply(*x));
-            [1.0].into_iter().chain(scaled).collect::<Vec<f64>>()
-        };
-        let data = RegressionData { rows: rows.iter().map(standard).collect(), outcomes, penalty };
-        let share = happened as f64 / outcomes.len() as f64;
-        let mut start = vec![0.0; columns + 1];
-        start[0] = (share / (1.0 - share)).ln();
-        let solved = data.minimise(start)?;
-        let weights: Vec<f64> =
-            solved[1..].iter().zip(&scales).map(|(weight, scale)| weight / scale.deviation).collect();
-        let shift: f64 = weights.iter().zip(&scales).map(|(weight, scale)| weight * scale.mean).sum();
-        Some(Self { intercept: solved[0] - shift, weights })
+///
+/// `rows` are the predictors **x**ᵢ, `outcomes` whether the event happened (yᵢ), `penalty` is λ. A predictor without spread has the
+/// weight 0. `None` unless both outcomes occur, all rows are equally long, all numbers are finite, and λ is above 0.
+pub fn logistic_regression(rows: &[Vec<f64>], outcomes: &[bool], penalty: f64) -> Option<Vec<f64>> {
+    let columns = rows.first()?.len();
+    let is_usable = |row: &Vec<f64>| row.len() == columns && row.iter().all(|x| x.is_finite());
+    let happened = outcomes.iter().filter(|outcome| **outcome).count();
+    let both = happened > 0 && happened < outcomes.len();
+    if rows.len() != outcomes.len()
+        || !both
+        || !rows.iter().all(is_usable)
+        || penalty.is_nan()
+        || penalty <= 0.0
+    {
+        return None;
     }
-
-    /// b.
-    pub fn intercept(&self) -> f64 {
-        self.intercept
+    let scales: Vec<Scale> = (0..columns).map(|k| Scale::of(rows.iter().map(|row| row[k]))).collect();
+    let standard = |row: &Vec<f64>| {
+        let scaled = row.iter().zip(&scales).map(|(x, scale)| scale.apply(*x));
+        [1.0].into_iter().chain(scaled).collect::<Vec<f64>>()
+    };
+    let data = RegressionData { rows: rows.iter().map(standard).collect(), outcomes, penalty };
+    let share = happened as f64 / outcomes.len() as f64;
+    let mut start = vec![0.0; columns + 1];
+    start[0] = (share / (1.0 - share)).ln();
+    let mut coefficients = data.minimise(start)?;
+    let (intercept, weights) = coefficients.split_first_mut()?;
+    for (weight, scale) in weights.iter_mut().zip(&scales) {
+        *weight /= scale.deviation;
+        *intercept -= *weight * scale.mean;
     }
-
-    /// wₖ, per unit of each predictor.
-    pub fn weights(&self) -> &[f64] {
-        &self.weights
-    }
-
-    /// The probability for these predictors, as many as there are weights.
-    pub fn probability(&self, row: &[f64]) -> f64 {
-        logistic(self.intercept + self.weights.iter().zip(row).map(|(weight, x)| weight * x).sum::<f64>())
-    }
+    Some(coefficients)
 }
 
 /// Mean and standard deviation of a predictor.
@@ -197,6 +176,10 @@ mod tests {
 
     use super::*;
 
+    fn probability(coefficients: &[f64], row: &[f64]) -> f64 {
+        logistic(coefficients[0] + dot(&coefficients[1..], row))
+    }
+
     /// 60 rows of three predictors with different units, and outcomes.
     fn example() -> (Vec<Vec<f64>>, Vec<bool>) {
         let row = |i: usize| {
@@ -223,30 +206,30 @@ mod tests {
             (1.0, 5.746_546_826_5, [1.356_611_333_7, -5.153_312_091_6, 1.296_692_357_1], 0.187_233_082_68),
             (10.0, 2.953_740_306_7, [0.584_957_209_5, -2.263_016_937_5, 0.637_621_703_8], 0.446_583_767_89),
         ] {
-            let model = LogisticModel::fit(&rows, &outcomes, penalty).unwrap();
-            assert!((model.intercept() - intercept).abs() < 1e-5, "{model:?}");
-            for (found, expected) in model.weights().iter().zip(weights) {
+            let model = logistic_regression(&rows, &outcomes, penalty).unwrap();
+            assert!(model.len() == 4 && (model[0] - intercept).abs() < 1e-5, "{model:?}");
+            for (found, expected) in model[1..].iter().zip(weights) {
                 assert!((found - expected).abs() < 1e-5, "{model:?}");
             }
-            assert!((model.probability(&rows[0]) - first).abs() < 1e-6, "{model:?}");
+            assert!((probability(&model, &rows[0]) - first).abs() < 1e-6, "{model:?}");
         }
     }
 
     #[test]
     fn what_has_no_unique_minimum_is_refused_or_harmless() {
         let rows = vec![vec![0.0], vec![1.0], vec![2.0]];
-        assert_eq!(LogisticModel::fit(&rows, &[true; 3], 1.0), None);
-        assert_eq!(LogisticModel::fit(&rows, &[true, false, true], 0.0), None);
-        assert_eq!(LogisticModel::fit(&[vec![f64::NAN], vec![1.0]], &[true, false], 1.0), None);
-        assert_eq!(LogisticModel::fit(&[], &[], 1.0), None);
+        assert_eq!(logistic_regression(&rows, &[true; 3], 1.0), None);
+        assert_eq!(logistic_regression(&rows, &[true, false, true], 0.0), None);
+        assert_eq!(logistic_regression(&[vec![f64::NAN], vec![1.0]], &[true, false], 1.0), None);
+        assert_eq!(logistic_regression(&[], &[], 1.0), None);
         // A predictor separates the outcomes: without the penalty its weight would be infinite.
-        let separated = LogisticModel::fit(&rows, &[true, true, false], 0.01).unwrap();
-        assert!(separated.weights()[0] < -1.0 && separated.weights()[0].is_finite(), "{separated:?}");
+        let separated = logistic_regression(&rows, &[true, true, false], 0.01).unwrap();
+        assert!(separated[1] < -1.0 && separated[1].is_finite(), "{separated:?}");
         // A predictor without spread says nothing: the share remains.
         let constant =
-            LogisticModel::fit(&[vec![5.0], vec![5.0], vec![5.0]], &[true, true, false], 1.0).unwrap();
-        assert_eq!(constant.weights(), [0.0]);
-        assert!((constant.probability(&[7.0]) - 2.0 / 3.0).abs() < 1e-9);
+            logistic_regression(&[vec![5.0], vec![5.0], vec![5.0]], &[true, true, false], 1.0).unwrap();
+        assert_eq!(constant[1..], [0.0]);
+        assert!((probability(&constant, &[7.0]) - 2.0 / 3.0).abs() < 1e-9);
     }
 
     proptest! {
@@ -260,14 +243,14 @@ mod tests {
         ) {
             let outcomes: Vec<bool> = data.iter().map(|(happened, ..)| *happened).collect();
             let rows: Vec<_> = data.iter().map(|(_, a, b)| vec![*a, *b]).collect();
-            let Some(model) = LogisticModel::fit(&rows, &outcomes, penalty) else { return Ok(()) };
-            let mean = rows.iter().map(|row| model.probability(row)).sum::<f64>() / rows.len() as f64;
+            let Some(model) = logistic_regression(&rows, &outcomes, penalty) else { return Ok(()) };
+            let mean = rows.iter().map(|row| probability(&model, row)).sum::<f64>() / rows.len() as f64;
             let share = outcomes.iter().filter(|happened| **happened).count() as f64 / rows.len() as f64;
             prop_assert!((mean - share).abs() < 1e-6, "{} {}", mean, share);
             let other: Vec<_> = rows.iter().map(|row| vec![unit * row[0] + 7.0, row[1]]).collect();
-            let other_model = LogisticModel::fit(&other, &outcomes, penalty).unwrap();
+            let other_model = logistic_regression(&other, &outcomes, penalty).unwrap();
             for (row, other) in rows.iter().zip(&other) {
-                prop_assert!((model.probability(row) - other_model.probability(other)).abs() < 1e-6);
+                prop_assert!((probability(&model, row) - probability(&other_model, other)).abs() < 1e-6);
             }
         }
     }

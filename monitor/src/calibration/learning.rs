@@ -10,7 +10,7 @@ use wire::ContentHash;
 use super::CalibrationState;
 
 /// Rows read from the store at a time.
-const PAGE_ROWS: u32 = 256;
+pub(super) const PAGE_ROWS: u32 = 256;
 
 /// A labelled structure.
 pub struct ArrivedLabel {
@@ -50,32 +50,36 @@ impl<'a> ArrivedLabels<'a> {
                 self.after = Some((last.number, last.decision));
                 continue;
             };
-            if arrival.number == self.last {
+            if arrival.number == self.last || version_of(&arrival, &self.versions) != Some(self.version) {
                 continue;
             }
-            if let Some(found) = self.of_version(&arrival) {
+            if let Some(found) = labelled_structure(&arrival) {
                 self.last = arrival.number;
                 return Ok(Some(found));
             }
         }
     }
+}
 
-    fn of_version(&self, arrival: &LabelArrival) -> Option<ArrivedLabel> {
-        let ExportSource::Candidate { block, original, .. } = &arrival.row.source else { return None };
-        let view = block.view();
-        if self.versions.of(view.id().walk.0) != self.version {
-            return None;
-        }
-        let label = &arrival.row.label;
-        let errors = view.forces.iter().zip(&label.forces).map(|(model, label)| norm(sub(*model, *label)));
-        let species = arrival.row.structure.species.iter().map(|species| species.symbol());
-        let atoms = original.gamma_nbr.iter().zip(errors).zip(species);
-        Some(ArrivedLabel {
-            content: view.id().content,
-            ordered_by_value: label.details.ordered_by_value,
-            atoms: atoms.map(|((grade, error), group)| GradedError { grade: *grade, error, group }).collect(),
-        })
-    }
+/// The version of the potential of the walk that found a structure; `None` for an imported one.
+pub(super) fn version_of(arrival: &LabelArrival, versions: &WalkVersions) -> Option<u32> {
+    let ExportSource::Candidate { block, .. } = &arrival.row.source else { return None };
+    Some(versions.of(block.view().id().walk.0))
+}
+
+/// What is learned from a structure; `None` for an imported one, which has no grades.
+pub(super) fn labelled_structure(arrival: &LabelArrival) -> Option<ArrivedLabel> {
+    let ExportSource::Candidate { block, original, .. } = &arrival.row.source else { return None };
+    let view = block.view();
+    let label = &arrival.row.label;
+    let errors = view.forces.iter().zip(&label.forces).map(|(model, label)| norm(sub(*model, *label)));
+    let species = arrival.row.structure.species.iter().map(|species| species.symbol());
+    let atoms = original.gamma_nbr.iter().zip(errors).zip(species);
+    Some(ArrivedLabel {
+        content: view.id().content,
+        ordered_by_value: label.details.ordered_by_value,
+        atoms: atoms.map(|((grade, error), group)| GradedError { grade: *grade, error, group }).collect(),
+    })
 }
 
 impl CalibrationState {

@@ -3,6 +3,9 @@
 
 mod expected;
 mod learning;
+mod reader;
+#[cfg(test)]
+mod reader_tests;
 mod summary;
 #[cfg(test)]
 mod tests;
@@ -14,6 +17,7 @@ use wire::ContentHash;
 use self::learning::ArrivedLabels;
 
 pub use expected::{AtomErrorBound, ExpectedErrors, expected_errors};
+pub use reader::CalibrationReader;
 pub use summary::{CalibrationBin, CalibrationCoverage, CalibrationMap, CalibrationSummary};
 
 /// What the bounds promise, and from how many structures they follow. Each bin has the bound of its newest 100 structures: with

@@ -8,7 +8,8 @@ use atoms::{Matrix3, Species, Structure, Vec3};
 use store::{ExportRow, ExportSource, FinishedCandidate};
 use wire::{ContentHash, Origin};
 
-/// Largest number of labelled, and of failed, structures that are kept, 150 bytes each. Beyond it, a sample of whole walks is kept.
+/// Largest number of labelled, and of failed, structures that are kept, 150 bytes each. Beyond it, a sample of whole walks is kept, the
+/// same walks of both.
 const MAX_FRAMES: usize = 1 << 17;
 /// Largest number of atoms that are kept, 48 bytes each. Beyond it, a systematic sample is kept.
 const MAX_ATOMS: usize = 1 << 18;
@@ -16,9 +17,9 @@ const MAX_ATOMS: usize = 1 << 18;
 /// Labelled and failed structures of biased and control walks.
 #[derive(Clone, Debug)]
 pub(super) struct ComparedFrames {
-    pub labelled: GroupSample<ComparedFrame>,
+    labelled: GroupSample<ComparedFrame>,
     pub atoms: SystematicSample<ComparedAtom>,
-    pub failed: GroupSample<FailedFrame>,
+    failed: GroupSample<FailedFrame>,
     /// Of each control walk, its biased walk.
     matched_walks: BTreeMap<u32, u32>,
 }
@@ -139,15 +140,47 @@ impl ComparedFrames {
             temperature: view.temperature(),
             relative_volume: view.relative_volume(),
         };
-        self.labelled.add(u64::from(walk), frame);
+        self.add_labelled(frame);
+    }
+
+    /// Adds a labelled structure.
+    pub fn add_labelled(&mut self, frame: ComparedFrame) {
+        self.labelled.add(u64::from(frame.place.walk), frame);
+        self.labelled.thin_together(&mut self.failed);
     }
 
     /// Adds a candidate whose label failed. `is_shared`: walks of both origins found it.
     pub fn add_failed(&mut self, candidate: &FinishedCandidate, is_shared: bool) {
         let FinishedCandidate { origin, walk, step, content, .. } = candidate;
         let walk = self.biased_walk(*walk);
-        let failed = FailedFrame { origin: *origin, walk, step: *step, content: *content, is_shared };
-        self.failed.add(u64::from(walk), failed);
+        self.add_failed_frame(FailedFrame {
+            origin: *origin,
+            walk,
+            step: *step,
+            content: *content,
+            is_shared,
+        });
+    }
+
+    /// Adds a structure whose label failed.
+    pub fn add_failed_frame(&mut self, frame: FailedFrame) {
+        self.failed.add(u64::from(frame.walk), frame);
+        self.failed.thin_together(&mut self.labelled);
+    }
+
+    /// The labelled structures that are kept.
+    pub fn labelled(&self) -> impl ExactSizeIterator<Item = &ComparedFrame> {
+        self.labelled.items()
+    }
+
+    /// The structures without a label that are kept.
+    pub fn failed(&self) -> impl ExactSizeIterator<Item = &FailedFrame> {
+        self.failed.items()
+    }
+
+    /// Number of labelled structures that were added.
+    pub fn labelled_in_all(&self) -> u64 {
+        self.labelled.total()
     }
 
     /// The walk itself if it is biased.

@@ -10,7 +10,7 @@ use store::{PendingJobs, QueuedStructure, Store, StoreError, WalkVersions};
 use wire::{CompletionPredictors, ContentHash};
 
 use super::{CoveringLabel, FeatureScales, MeanFeatures, QueuedLabel};
-use crate::calibration::{self, CalibrationState};
+use crate::calibration::{CalibrationReader, CalibrationState};
 use crate::completion_model::{CompletionExample, CompletionModel, MAX_FINISHED};
 use crate::label_cost::CostEstimator;
 
@@ -18,12 +18,19 @@ use crate::label_cost::CostEstimator;
 /// which they were found.
 pub const MAX_QUEUED: u32 = 1_000;
 
-/// Reads the rows of the order, and keeps what does not change of each structure.
+/// Reads the rows of the order, and keeps what does not change of each structure and what was learned from labels.
 pub struct LabelOrderReader {
+    structures: KnownStructures,
+    calibrations: CalibrationReader,
+}
+
+/// What does not change of the structures of the last reading.
+struct KnownStructures {
     /// The version of the potential of the walks, whose mixture gives the scales.
     version: u32,
     scales: FeatureScales,
-    structures: HashMap<i64, KnownProperties>,
+    /// By decision.
+    known: HashMap<i64, KnownProperties>,
 }
 
 /// What does not change of a structure.
@@ -43,9 +50,10 @@ pub struct OrderInputs {
     pub completion: Option<CompletionModel>,
 }
 
-/// What was learned from the labels of one version of the potential.
-struct VersionModels {
-    calibration: CalibrationState,
+/// What was learned from the finished structures of one version of the potential.
+struct VersionModels<'a> {
+    /// `None` before the first label.
+    calibration: Option<&'a CalibrationState>,
     completion: Option<CompletionModel>,
 }
 
@@ -53,28 +61,38 @@ impl LabelOrderReader {
     /// For a campaign whose walks have this version of the potential. Features are comparable by the scales of its mixture;
     /// structures of other versions do not cover one another.
     pub fn new(version: u32, scales: FeatureScales) -> Self {
-        Self { version, scales, structures: HashMap::new() }
+        let structures = KnownStructures { version, scales, known: HashMap::new() };
+        Self { structures, calibrations: CalibrationReader::default() }
     }
 
     /// Reads the store. `protocol` is that in force.
     pub async fn read(&mut self, store: &Store, protocol: ContentHash) -> Result<OrderInputs, StoreError> {
+        self.calibrations.read(store, protocol).await?;
+        let structures = &mut self.structures;
         let versions = store.walk_versions().await?;
         let queued = store.queued_structures(protocol, MAX_QUEUED).await?;
         let costs = CostEstimator::from_store(store, protocol).await?;
         let (mut used, mut covering, mut models) = (HashSet::new(), Vec::new(), HashMap::new());
         let mut of_queue: BTreeSet<u32> = queued.iter().map(|found| versions.of(found.walk)).collect();
-        of_queue.insert(self.version);
+        of_queue.insert(structures.version);
         for version in of_queue {
-            let learned = self.learn(store, protocol, version, &mut used, &mut covering).await?;
-            models.insert(version, learned);
+            let completion = structures.learn(store, protocol, version, &mut used, &mut covering).await?;
+            let calibration = self.calibrations.of_version(version);
+            models.insert(version, VersionModels { calibration, completion });
         }
         let mut rows = Vec::with_capacity(queued.len());
         for found in &queued {
             used.insert(found.decision);
             let version = versions.of(found.walk);
             let gamma = maximum(&found.original.gamma);
-            let known =
-                self.known(store, version, found.decision, &found.structure, gamma, found.relative_volume);
+            let known = structures.known(
+                store,
+                version,
+                found.decision,
+                &found.structure,
+                gamma,
+                found.relative_volume,
+            );
             let known = known.await?;
             match (found.leased, &known.features) {
                 (true, None) => {}
@@ -85,13 +103,15 @@ impl LabelOrderReader {
                 (false, _) => rows.push(row(found, &versions, known, &models[&version], &costs)),
             }
         }
-        self.structures.retain(|decision, _| used.contains(decision));
-        let completion = models.remove(&self.version).and_then(|models| models.completion);
+        structures.known.retain(|decision, _| used.contains(decision));
+        let completion = models.remove(&structures.version).and_then(|models| models.completion);
         Ok(OrderInputs { rows, covering, completion })
     }
+}
 
-    /// Learns from the finished labels of a version. Adds the decisions on their structures to `used`, and those that cover others
-    /// to `covering`.
+impl KnownStructures {
+    /// Learns from the finished structures of a version which of them complete. Adds the decisions on them to `used`, and those
+    /// that cover others to `covering`.
     async fn learn(
         &mut self,
         store: &Store,
@@ -99,8 +119,7 @@ impl LabelOrderReader {
         version: u32,
         used: &mut HashSet<i64>,
         covering: &mut Vec<CoveringLabel>,
-    ) -> Result<VersionModels, StoreError> {
-        let calibration = calibration::read(store, protocol, version).await?;
+    ) -> Result<Option<CompletionModel>, StoreError> {
         let finished = store.finished_structures(protocol, version, MAX_FINISHED).await?;
         let mut examples = Vec::with_capacity(finished.len());
         for found in &finished {
@@ -119,7 +138,7 @@ impl LabelOrderReader {
                 covering.push(CoveringLabel { decision: found.decision, version, features });
             }
         }
-        Ok(VersionModels { calibration, completion: CompletionModel::fit(&examples) })
+        Ok(CompletionModel::fit(&examples))
     }
 
     /// What does not change of a structure, computed the first time.
@@ -132,7 +151,7 @@ impl LabelOrderReader {
         gamma: f64,
         relative_volume: Option<f64>,
     ) -> Result<&KnownProperties, StoreError> {
-        let place = match self.structures.entry(decision) {
+        let place = match self.known.entry(decision) {
             Entry::Occupied(known) => return Ok(known.into_mut()),
             Entry::Vacant(place) => place,
         };
@@ -151,7 +170,7 @@ fn row(
     found: &QueuedStructure,
     versions: &WalkVersions,
     known: &KnownProperties,
-    models: &VersionModels,
+    models: &VersionModels<'_>,
     costs: &CostEstimator,
 ) -> QueuedLabel {
     let QueuedStructure { seed_structure, formula, structure, original, .. } = found;
@@ -167,7 +186,7 @@ fn row(
         decision: found.decision,
         priority: found.priority,
         version: versions.of(found.walk),
-        expected_error: mean_error(&models.calibration, &original.gamma_nbr),
+        expected_error: models.calibration.and_then(|found| mean_error(found, &original.gamma_nbr)),
         completion: completion.map(|(model, predictors)| model.probability(predictors)),
         core_hours: costs.predict_job(&size).map(|cost| cost.expected),
         overtaken: found.overtaken,

@@ -94,6 +94,11 @@ async fn frequent_queries_use_indexes() {
         let page = plan(&file, sql).await;
         assert!(page.contains("USING COVERING INDEX job_order (state=?"), "{page}");
     }
+    let sum = plan(&file, label_arrivals::SUM).await;
+    assert!(
+        sum.contains("SCAN label USING COVERING INDEX label_of") && !sum.contains("SCAN candidate"),
+        "{sum}"
+    );
     let by_structure = plan(&file, check::export::CANDIDATES).await;
     assert!(by_structure.contains("SEARCH candidate USING INDEX candidate_structure"), "{by_structure}");
     for sql in [lower_states::ALL, lower_states::COUNT] {

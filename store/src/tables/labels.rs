@@ -20,7 +20,8 @@ impl Store {
     /// ([`Store::relabel`]), the first result of an attempt that began after the request becomes the label and
     /// supersedes the old one. [`Store::set_lower_state_rule`] may prefer a lower state. A job that was dropped or
     /// superseded meanwhile stays so. The label's details get the retry adjustments of its calculation
-    /// ([`Store::record_calculation`]), and whether its job had a value when it was leased. Delivering the result of an attempt twice changes nothing.
+    /// ([`Store::record_calculation`]), and whether the lease was by value. Delivering the result of an attempt
+    /// twice changes nothing.
     ///
     /// # Errors
     /// [`StoreError::InvalidLabel`] for a wrong number of forces, or for numbers that are not finite.
@@ -55,20 +56,19 @@ impl Store {
     }
 }
 
-/// The label with the retry adjustments of its calculation, and whether its job was leased by value.
+/// The label with the retry adjustments of its calculation, and whether the lease was by value: its job may have got another value, or
+/// none, since.
 async fn with_calculation_details(
     transaction: &mut Transaction,
     lease: &Lease,
     label: &Label,
 ) -> Result<Label> {
-    let sql = "SELECT remedies, value FROM attempt CROSS JOIN job ON job.number = attempt.job
-               WHERE attempt.job = $1 AND attempt.attempt = $2";
-    let found = query(sql).bind(lease.job).bind(lease.attempt);
-    let found: Option<(Option<String>, Option<f64>)> = found.fetch_optional(&mut *transaction).await?;
-    let (names, value) = found.unwrap_or_default();
+    let found = query("SELECT remedies FROM attempt WHERE job = $1 AND attempt = $2");
+    let found = found.bind(lease.job).bind(lease.attempt);
+    let names: Option<Option<String>> = found.fetch_optional(&mut *transaction).await?;
     let mut label = label.clone();
-    label.details.ordered_by_value = value.is_some();
-    if let Some(names) = names {
+    label.details.ordered_by_value = lease.ordered_by_value;
+    if let Some(names) = names.flatten() {
         label.details.retry_adjustments = names.split(',').map(str::to_owned).collect();
     }
     Ok(label)

@@ -20,7 +20,8 @@ use crate::processes::ProcessRecord;
 use crate::records::{JobState, Lease};
 
 /// The next job by priority, then by value, then in decision order.
-pub(crate) const NEXT: &str = "SELECT number, structure, decision, attempts, failures, overruled FROM job
+pub(crate) const NEXT: &str =
+    "SELECT number, structure, decision, attempts, failures, overruled, value FROM job
     WHERE state = 'queued' AND protocol = $1 ORDER BY priority DESC, value DESC NULLS LAST, decision LIMIT 1";
 
 pub(crate) const EXPIRED: &str = "SELECT number, holder FROM job WHERE state = 'leased' AND expires <= $1";
@@ -46,9 +47,10 @@ struct NextJob {
     attempts: u32,
     failures: u32,
     overruled: Option<i64>,
+    value: Option<f64>,
 }
 
-from_columns!(NextJob { number, structure, decision, attempts, failures, overruled });
+from_columns!(NextJob { number, structure, decision, attempts, failures, overruled, value });
 
 impl Store {
     /// Leases the next job of that protocol to `holder` (`process` or `process/part`), for `seconds` from `now` on: of the
@@ -99,6 +101,7 @@ impl Store {
             failures: classes_of_failures(&mut transaction, job, next.failures).await?,
             failed_calculations: failed_calculations(&mut transaction, job).await?,
             overruled: next.overruled.is_some(),
+            ordered_by_value: next.value.is_some(),
             structure: structure_of(&mut transaction, next.structure).await?,
             candidate,
             model_energy,

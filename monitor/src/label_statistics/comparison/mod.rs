@@ -75,7 +75,7 @@ impl WalkComparison {
     /// ten seconds of one core, shared by all cores, in a large campaign.
     pub(super) fn new(frames: &ComparedFrames, bootstrap: Bootstrap) -> Self {
         let matched = pairs::match_frames(frames);
-        let labelled: Vec<&ComparedFrame> = frames.labelled.items().collect();
+        let labelled: Vec<&ComparedFrame> = frames.labelled().collect();
         let atoms: Vec<&ComparedAtom> = frames.atoms.items().collect();
         let pooled = |origins: &[Origin], with_shared: bool| {
             let is_in = |origin: Origin, is_shared: bool| {
@@ -101,7 +101,7 @@ impl WalkComparison {
             level: bootstrap.level,
             draws: bootstrap.draws,
             rng_seed: bootstrap.seed,
-            structures: frames.labelled.total(),
+            structures: frames.labelled_in_all(),
             sampled_structures: labelled.len() as u64,
             atoms: frames.atoms.total(),
             sampled_atoms: atoms.len() as u64,
@@ -124,6 +124,6 @@ impl WalkComparison {
 fn failed(frames: &ComparedFrames, origins: &[Origin]) -> u64 {
     let is_of =
         |failed: &&FailedFrame| origins.contains(&failed.origin) && (origins.len() > 1 || !failed.is_shared);
-    let of = frames.failed.items().filter(is_of);
+    let of = frames.failed().filter(is_of);
     of.map(|failed| failed.content).collect::<HashSet<ContentHash>>().len() as u64
 }

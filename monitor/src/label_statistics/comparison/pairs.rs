@@ -132,11 +132,11 @@ impl LabelOutcome<'_> {
 pub(super) fn match_frames(frames: &ComparedFrames) -> MatchedFrames<'_> {
     let mut places: BTreeMap<(u32, u64), [Option<LabelOutcome>; 2]> = BTreeMap::new();
     let side = |origin: Origin| usize::from(origin == Origin::Control);
-    for frame in frames.labelled.items() {
+    for frame in frames.labelled() {
         let sides = places.entry((frame.place.walk, frame.step)).or_default();
         sides[side(frame.place.origin)].get_or_insert(LabelOutcome::Labelled(frame));
     }
-    for failed in frames.failed.items() {
+    for failed in frames.failed() {
         let sides = places.entry((failed.walk, failed.step)).or_default();
         sides[side(failed.origin)].get_or_insert(LabelOutcome::Failed(failed.content));
     }

@@ -61,7 +61,7 @@ fn add(frames: &mut ComparedFrames, origin: Origin, f: u64, is_shared: bool) {
     let content = content(if is_shared { f } else { 100 * side(origin) + f });
     let (temperature, relative_volume) = (2000.0 - 500.0 * side(origin) as f64 + f as f64, 1.1);
     let frame = ComparedFrame { place, step, content, is_shared, errors, temperature, relative_volume };
-    frames.labelled.add(f / 2, frame);
+    frames.add_labelled(frame);
 }
 
 fn fail(frames: &mut ComparedFrames, origin: Origin, f: u64) {
@@ -72,7 +72,7 @@ fn fail(frames: &mut ComparedFrames, origin: Origin, f: u64) {
         content: content(1000 + 100 * side(origin) + f),
         is_shared: false,
     };
-    frames.failed.add(f / 2, failed);
+    frames.add_failed_frame(failed);
 }
 
 /// 12 seed structures: 24 structures of either origin. The first is that of both, and two labels failed.
@@ -173,12 +173,12 @@ fn small(seed_structures: u64, walks: u64) -> WalkComparison {
             add(&mut frames, origin, 2 * f, false);
         }
     }
-    let labelled: Vec<_> = frames.labelled.items().cloned().collect();
+    let labelled: Vec<_> = frames.labelled().cloned().collect();
     let mut grouped = ComparedFrames::new(BTreeMap::new());
     grouped.atoms = frames.atoms;
     for frame in labelled {
         let place = FramePlace { seed_structure: frame.place.walk % seed_structures as u32, ..frame.place };
-        grouped.labelled.add(u64::from(place.walk), ComparedFrame { place, ..frame });
+        grouped.add_labelled(ComparedFrame { place, ..frame });
     }
     WalkComparison::new(&grouped, FEW_DRAWS)
 }
@@ -277,7 +277,7 @@ fn synthetic(repetition: u64, with_atoms: bool) -> ComparedFrames {
                 temperature: 300.0,
                 relative_volume: 1.0,
             };
-            frames.labelled.add(walk, frame);
+            frames.add_labelled(frame);
         }
     }
     frames
@@ -320,7 +320,7 @@ fn intervals_of_rank_statistics_hold_the_truth_as_often_as_they_say() {
     ];
     let found = coverage(1000, truth, |repetition| {
         let frames = synthetic(repetition, true);
-        let labelled = frames.labelled.items().filter(|frame| frame.place.origin == Origin::Biased);
+        let labelled = frames.labelled().filter(|frame| frame.place.origin == Origin::Biased);
         let (labelled, atoms): (Vec<_>, Vec<_>) = (labelled.collect(), frames.atoms.items().collect());
         let group = ComparedGroup::new(&labelled, &atoms, 0, Bootstrap { seed: repetition, ..FEW_DRAWS });
         [group.gamma.spearman, group.gamma.roc_auc[12]]

@@ -1,0 +1,68 @@
+//! Calibrations that are kept up to date with the labels of a campaign.
+
+use std::collections::BTreeMap;
+
+use store::{ArrivalSum, LabelArrival, Store, StoreError, WalkVersions};
+use wire::ContentHash;
+
+use super::CalibrationState;
+use super::learning::{PAGE_ROWS, labelled_structure, version_of};
+
+/// Keeps the calibrations of all versions of the potential, so that each reading costs what is new.
+///
+/// A calibration depends on the order of its labels. Each reading therefore first compares a sum over the labels that it knows
+/// ([`ArrivalSum`]) with that of the database, and reads all again if they differ.
+#[derive(Default)]
+pub struct CalibrationReader {
+    protocol: Option<ContentHash>,
+    /// Label and decision of the last row that was read.
+    after: Option<(i64, i64)>,
+    /// Over all rows that were read.
+    sum: ArrivalSum,
+    versions: BTreeMap<u32, LearnedVersion>,
+}
+
+struct LearnedVersion {
+    state: CalibrationState,
+    /// The last label that it learned from.
+    last: i64,
+}
+
+impl CalibrationReader {
+    /// Reads the labels that came since the last reading, under `protocol`. Returns the number of labelled candidates that it read.
+    pub async fn read(&mut self, store: &Store, protocol: ContentHash) -> Result<u64, StoreError> {
+        let known = store.label_arrivals_until(protocol, self.after).await?;
+        if self.protocol != Some(protocol) || self.sum != known {
+            *self = Self { protocol: Some(protocol), ..Self::default() };
+        }
+        let mut read = 0;
+        loop {
+            let page = store.label_arrivals(protocol, self.after, PAGE_ROWS).await?;
+            let Some(last) = page.last() else { return Ok(read) };
+            // After the labels: a walk is in the store before its labels are.
+            let versions = store.walk_versions().await?;
+            page.iter().for_each(|arrival| self.learn(arrival, &versions));
+            self.after = Some((last.number, last.decision));
+            read += page.len() as u64;
+        }
+    }
+
+    /// The calibration of a version; `None` before its first label.
+    pub fn of_version(&self, version: u32) -> Option<&CalibrationState> {
+        self.versions.get(&version).map(|learned| &learned.state)
+    }
+
+    /// Learns from a structure, once for each version whose walks found it.
+    fn learn(&mut self, arrival: &LabelArrival, versions: &WalkVersions) {
+        self.sum.add(arrival);
+        let Some(version) = version_of(arrival, versions) else { return };
+        let empty = || LearnedVersion { state: CalibrationState::new(version), last: 0 };
+        let learned = self.versions.entry(version).or_insert_with(empty);
+        if learned.last != arrival.number
+            && let Some(labelled) = labelled_structure(arrival)
+        {
+            learned.last = arrival.number;
+            learned.state.learn(&labelled);
+        }
+    }
+}
