@@ -3,10 +3,11 @@
 use std::collections::VecDeque;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::Path;
-use std::process::{Child, ChildStdin, Command, Stdio};
+use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
+use std::time::Duration;
 
 use tracing::debug;
 
@@ -14,6 +15,8 @@ use crate::settings::PythonSettings;
 
 /// Lines of standard error that are kept for error messages.
 const KEPT_LINES: usize = 12;
+/// How often an exit is looked for before the process is killed.
+const EXIT_POLLS: u32 = 20;
 
 /// What a server has to say.
 #[derive(Debug)]
@@ -102,9 +105,9 @@ impl ServerProcess {
 
     /// Ends it and says how it ended, with the last lines that it wrote.
     pub fn end(mut self) -> String {
-        let ended = match self.child.try_wait() {
-            Ok(Some(status)) => status.to_string(),
-            _ => {
+        let ended = match self.wait_for_exit() {
+            Some(status) => status.to_string(),
+            None => {
                 let _ = self.child.kill();
                 let _ = self.child.wait();
                 "killed".to_owned()
@@ -113,6 +116,19 @@ impl ServerProcess {
         let lines = self.last_lines.lock().unwrap_or_else(PoisonError::into_inner);
         let lines: Vec<_> = lines.iter().map(String::as_str).collect();
         if lines.is_empty() { ended } else { format!("{ended}; its last lines:\n  {}", lines.join("\n  ")) }
+    }
+}
+
+impl ServerProcess {
+    /// How it has ended. Who closes its standard output ends a moment later.
+    fn wait_for_exit(&mut self) -> Option<ExitStatus> {
+        for _ in 0..EXIT_POLLS {
+            if let Ok(Some(status)) = self.child.try_wait() {
+                return Some(status);
+            }
+            thread::sleep(Duration::from_millis(10));
+        }
+        None
     }
 }
 

@@ -36,7 +36,7 @@ fn faults_change_no_result() {
 /// A batch that is too large is halved, and results are the same.
 #[test]
 fn batches_fit_into_the_memory() {
-    let fixture = Fixture::new(json!({ "memory_above": 3, "base_seconds": 0.01 }));
+    let fixture = Fixture::new(json!({ "memory_above": 5, "base_seconds": 0.01 }));
     let device = fixture.device().unwrap();
     let model = Fixture::model(&device);
     std::thread::scope(|scope| {

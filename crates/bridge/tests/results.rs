@@ -87,7 +87,7 @@ fn shared_memory_changes_nothing() {
     let fixture = Fixture::new(json!({}));
     let device = fixture.device().unwrap();
     let place = ShmDir::for_campaign(fixture.directory.path()).unwrap();
-    let _prepared = place.prepare(1 << 24).unwrap();
+    let prepared = place.prepare(1 << 24).unwrap();
     // Messages grow beyond what was expected.
     let service = DeviceService::open(&device, &place, 7, 4, 64).unwrap();
     let address = service.address().clone();
@@ -107,6 +107,6 @@ fn shared_memory_changes_nothing() {
             });
         }
     });
-    drop(service);
+    drop((service, prepared));
     place.remove().unwrap();
 }

@@ -89,10 +89,10 @@ fn packages(found: &PythonVersions, interpreter: &Path) -> Vec<MachineCheck> {
         .cloned()
         .flatten()
     {
-        Some(version) => MachineCheck::present(name, version, needed_for),
+        Some(version) => MachineCheck::present(*name, version, needed_for),
         None => {
             let advice = format!("{} -m pip install {name}", interpreter.display());
-            MachineCheck::absent(name, "not installed", needed_for, advice)
+            MachineCheck::absent(*name, "not installed", needed_for, advice)
         }
     };
     PACKAGES.iter().map(check).collect()
