@@ -3,6 +3,7 @@
 pub mod agent_host;
 mod agent_service;
 mod db_status;
+mod device_watch;
 mod label_order;
 pub mod label_pool;
 mod labellers;
@@ -97,10 +98,11 @@ async fn run_walks(
     }
     let order = LabelOrderTask::start(run).await?;
     let completion = order.completion.clone();
-    match mode.in_process {
+    let ended = match mode.in_process {
         true => single_process::run(run, selector, completion).await,
         false => multi_process::run(run, selector, completion).await,
-    }
+    };
+    device_watch::failure(run.campaign).map_or(ended, Err)
 }
 
 /// The task that runs the reactor.

@@ -23,6 +23,7 @@ use wire::net::StopTokens;
 use wire::shm_dir::ShmDir;
 
 use super::agent_service::AgentService;
+use super::device_watch::{self, DeviceWatch};
 use super::label_order::CompletionModels;
 use super::process_manager::{self, ProcessManager};
 use super::{CHANNEL, ReactorTask, RunContext, spawn, start_reactor, wanted_walkers};
@@ -121,7 +122,9 @@ async fn run_in(
     let serving = tokio::spawn(async {
         tokio::try_join!(async { local.await.map_err(CommandError::failed) }, remote).map(|_| ())
     });
-    let reactor = start_reactor(run, selector, incoming, stopping, completion);
+    let walks = stopping.child_token();
+    let _watch = DeviceWatch::start(campaign, &walks);
+    let reactor = start_reactor(run, selector, incoming, walks, completion);
     supervise(manager, reactor, no_more_work, serving, run).await
 }
 
@@ -151,7 +154,7 @@ async fn supervise(
     mut reactor: ReactorTask,
     no_more_work: CancellationToken,
     mut serving: JoinHandle<Result<(), CommandError>>,
-    RunContext { stop, superseded, .. }: RunContext<'_>,
+    RunContext { stop, superseded, campaign, .. }: RunContext<'_>,
 ) -> Result<reactor::RunOutcome, CommandError> {
     let (mut reactor_result, mut transport_result, mut stop_requested) = (None, None, false);
     let mut database_deadline = None;
@@ -177,6 +180,11 @@ async fn supervise(
                 match ended {
                     // The walks of the newer version do not wait for the labels of those that made room.
                     Ok(reactor::RunOutcome::Finished) if !superseded.is_cancelled() => {
+                        manager.wait_for_labels();
+                    }
+                    Ok(reactor::RunOutcome::Stopped)
+                        if !stop_requested && device_watch::has_failed(campaign) =>
+                    {
                         manager.wait_for_labels();
                     }
                     _ => manager.stop(),

@@ -18,6 +18,7 @@ use workers::walk::WalkContext;
 use workers::walker;
 
 use super::db_status::DbStatus;
+use super::device_watch::DeviceWatch;
 use super::label_order::CompletionModels;
 use super::process_manager::LABEL_CHECK_INTERVAL;
 use super::spawn::stop_labellers;
@@ -66,6 +67,7 @@ struct Tasks {
     closing: Arc<Shutdown>,
     /// Stops walkers and reactor, but not the labellers.
     stopping: CancellationToken,
+    _watch: DeviceWatch,
 }
 
 impl Tasks {
@@ -83,7 +85,8 @@ impl Tasks {
         let reactor = start_reactor(run, selector, incoming, stopping.clone(), completion);
         let external_labels = labellers.is_empty().then(|| run.store.clone());
         let superseded = run.superseded.clone();
-        Ok(Self { walkers, labellers, reactor, superseded, external_labels, closing, stopping })
+        let _watch = DeviceWatch::start(run.campaign, &stopping);
+        Ok(Self { walkers, labellers, reactor, superseded, external_labels, closing, stopping, _watch })
     }
 
     /// Waits for all of them. A labeller that cannot go on stops the campaign, because its queue could only grow.
