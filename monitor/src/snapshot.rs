@@ -12,9 +12,13 @@ use crate::provenance::Provenance;
 use crate::reference_check::ReferenceCheck;
 use crate::versions::CampaignVersions;
 use crate::walk_ends::WalkEnds;
+use wire::DeviceStatistics;
 
 /// Version of the JSON format; incremented when a key is removed or changes its meaning.
 pub const FORMAT: u32 = 1;
+
+/// Metadata of the store: [`DeviceStatistics`].
+pub const DEVICE: &str = "device";
 
 /// The state of a campaign, read within a short time.
 #[derive(Debug)]
@@ -39,6 +43,8 @@ pub struct Snapshot {
     pub check: Option<ReferenceCheck>,
     /// Versions of the potential.
     pub versions: CampaignVersions,
+    /// What the device of the present or last run has done. `None` for models that this program evaluates.
+    pub device: Option<DeviceStatistics>,
 }
 
 impl Snapshot {
@@ -59,6 +65,7 @@ impl Snapshot {
             origin: Provenance::read(store).await?,
             check: ReferenceCheck::read(store).await?,
             versions: CampaignVersions::read(store, &status, &values).await?,
+            device: read_device(store).await?,
             mixture: MixtureValues(values),
             disk: DiskUse { bytes: store.size().await?, forecast },
             campaign,
@@ -69,7 +76,19 @@ impl Snapshot {
 
     /// The JSON of `calmwalk status` (docs/status.md), without the jobs of a batch system and without sentences.
     pub fn to_json(&self) -> serde_json::Result<Value> {
-        let Self { campaign, origin, status, mixture, disk, labels, end, end_reason, check, versions } = self;
+        let Self {
+            campaign,
+            origin,
+            status,
+            mixture,
+            disk,
+            labels,
+            end,
+            end_reason,
+            check,
+            versions,
+            device,
+        } = self;
         let mut json = serde_json::to_value(status)?;
         json["version"] = FORMAT.into();
         json["campaign"] = campaign.id.to_string().into();
@@ -89,7 +108,23 @@ impl Snapshot {
         json["reference_check"] = check.as_ref().map_or(Value::Null, ReferenceCheck::to_json);
         json["versions"] = json!(versions.all);
         json["refit"] = json!(versions.refit);
+        json["device"] = device.as_ref().map_or(Value::Null, device_json);
         labels.add_to(&mut json, status);
         Ok(json)
     }
+}
+
+async fn read_device(store: &Store) -> Result<Option<DeviceStatistics>, StoreError> {
+    let text = store.metadata(DEVICE).await?;
+    Ok(text.and_then(|text| serde_json::from_str(&text).ok()))
+}
+
+/// The statistics with what follows from them.
+fn device_json(device: &DeviceStatistics) -> Value {
+    let mut json = json!(device);
+    json["busy_share"] = json!(device.busy_share());
+    json["mean_batch"] = json!(device.mean_batch());
+    json["mean_wait"] = json!(device.mean_wait());
+    json["bonds_per_second"] = json!(device.bonds_per_second());
+    json
 }

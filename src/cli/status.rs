@@ -104,7 +104,7 @@ fn write(
 }
 
 fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &StatusLayout) -> io::Result<()> {
-    let Snapshot { campaign, origin, status, mixture, disk, labels, check, versions, .. } = snapshot;
+    let Snapshot { campaign, origin, status, mixture, disk, labels, check, versions, device, .. } = snapshot;
     let (name, mode) = (origin.as_ref().map_or("", |origin| &origin.name), &campaign.mode);
     let id = campaign.id.to_string();
     // Ids of candidates start with the same eight characters.
@@ -138,6 +138,9 @@ fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &StatusLayout) -> 
     }
     if let Some(budget) = budget::describe(&status.budget) {
         page.titled(out, "budget", &budget)?;
+    }
+    if let Some(device) = device {
+        page.titled(out, "device", &wording::device::describe(device))?;
     }
     page.titled(out, "disk", &describe_disk(disk, page, status))?;
     match end(snapshot) {

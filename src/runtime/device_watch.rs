@@ -1,25 +1,52 @@
-//! What happens when the program of the model fails for good: walks end, labels go on.
+//! Watches the device of a model in Python: what it does, and what happens when its program fails for good: walks end, labels go on.
 
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge::Device;
+use monitor::DEVICE;
+use store::Store;
 use tokio::task::JoinHandle;
+use tokio::time::interval;
 use tokio_util::sync::CancellationToken;
 
 use crate::campaign::LoadedCampaign;
 use crate::exit_status::CommandError;
 use crate::output::log_and_print;
 
-/// Ends the walks with the device. Dropping it ends the watch.
+/// Interval between writes of what the device has done.
+const WRITE_INTERVAL: Duration = Duration::from_secs(3);
+
+/// Ends the walks with the device, and writes what the device does to the store. Dropping it ends the watch.
 pub struct DeviceWatch(Option<JoinHandle<()>>);
 
 impl DeviceWatch {
     /// Cancels `walks` when the device of the campaign's model, if it has one, has failed for good.
-    pub fn start(campaign: &LoadedCampaign, walks: &CancellationToken) -> Self {
+    pub fn start(campaign: &LoadedCampaign, store: &Store, walks: &CancellationToken) -> Self {
         let Some(device) = campaign.model.device() else { return Self(None) };
-        let (broken, walks) = (device.broken().clone(), walks.clone());
+        let (device, store, walks) = (Arc::clone(device), store.clone(), walks.clone());
         Self(Some(tokio::spawn(async move {
-            broken.cancelled().await;
+            let broken = device.broken().clone();
+            tokio::select! {
+                () = broken.cancelled() => {}
+                never = record(&device, &store) => match never {},
+            }
             log_and_print("the model's program has failed for good: no walk goes on, labels are still made");
             walks.cancel();
+            match record(&device, &store).await {}
         })))
+    }
+}
+
+/// Writes what the device has done, for ever. Ignores errors: other writers report a broken database.
+async fn record(device: &Device, store: &Store) -> Infallible {
+    let mut write = interval(WRITE_INTERVAL);
+    loop {
+        write.tick().await;
+        if let Ok(text) = serde_json::to_string(&device.statistics()) {
+            let _ = store.set_metadata(DEVICE, &text).await;
+        }
     }
 }
 

@@ -123,7 +123,7 @@ async fn run_in(
         tokio::try_join!(async { local.await.map_err(CommandError::failed) }, remote).map(|_| ())
     });
     let walks = stopping.child_token();
-    let _watch = DeviceWatch::start(campaign, &walks);
+    let _watch = DeviceWatch::start(campaign, store, &walks);
     let reactor = start_reactor(run, selector, incoming, walks, completion);
     supervise(manager, reactor, no_more_work, serving, run).await
 }

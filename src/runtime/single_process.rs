@@ -85,7 +85,7 @@ impl Tasks {
         let reactor = start_reactor(run, selector, incoming, stopping.clone(), completion);
         let external_labels = labellers.is_empty().then(|| run.store.clone());
         let superseded = run.superseded.clone();
-        let _watch = DeviceWatch::start(run.campaign, &stopping);
+        let _watch = DeviceWatch::start(run.campaign, run.store, &stopping);
         Ok(Self { walkers, labellers, reactor, superseded, external_labels, closing, stopping, _watch })
     }
 

@@ -42,6 +42,9 @@ pub fn text(snapshot: &Snapshot) -> String {
     );
     candidates(&mut text, status);
     walks(&mut text, status);
+    if let Some(found) = &snapshot.device {
+        device(&mut text, found);
+    }
     label_queue(&mut text, status);
     let failures: Vec<_> =
         snapshot.labels.failures.iter().map(|failure| [("class", failure.class.as_str())]).collect();
@@ -97,6 +100,23 @@ fn candidates(text: &mut MetricsText, status: &CampaignStatus) {
     );
     let version = status.mixture_version as f64;
     text.gauge("calmwalk_mixture_version", "Version of the mixture in force.", &[(&[], version)]);
+}
+
+/// The device of a model in Python.
+fn device(text: &mut MetricsText, device: &DeviceStatistics) {
+    let mut counter = |name, help, value| text.counter(name, help, &[(&[], value)]);
+    counter("calmwalk_device_batches_total", "Batches that the device evaluated.", device.batches as f64);
+    counter("calmwalk_device_structures_total", "Structures in them.", device.structures as f64);
+    counter("calmwalk_device_bonds_total", "Directed bonds in them.", device.bonds as f64);
+    counter("calmwalk_device_busy_seconds_total", "Time for which the device had work.", device.busy);
+    counter("calmwalk_device_wait_seconds_total", "Time that calls waited for their batch.", device.waited);
+    counter("calmwalk_device_compile_seconds_total", "Time of batches of a new shape.", device.compiled);
+    counter("calmwalk_device_restarts_total", "Restarts of the model's program.", device.restarts as f64);
+    text.gauge(
+        "calmwalk_device_busy_ratio",
+        "Share of the time for which the device had work.",
+        &[(&[], device.busy_share())],
+    );
 }
 
 fn walks(text: &mut MetricsText, status: &CampaignStatus) {

@@ -5,6 +5,7 @@ pub mod calibration;
 pub mod comparison;
 pub mod cost;
 pub mod date;
+pub mod device;
 pub mod disk;
 pub mod end_reason;
 pub mod energies;

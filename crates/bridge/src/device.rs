@@ -9,6 +9,7 @@ use atoms::{NeighbourList, Structure};
 use potentials::ModelWithFeatures;
 use tempfile::TempDir;
 use tokio_util::sync::CancellationToken;
+use wire::DeviceStatistics;
 use wire::ipc::IncomingCall;
 
 use crate::call::{Call, Geometry, Topology};
@@ -16,7 +17,6 @@ use crate::description::ModelDescription;
 use crate::model::PythonModel;
 use crate::self_test::{SelfTestError, SelfTestReport};
 use crate::settings::PythonSettings;
-use crate::statistics::DeviceStatistics;
 use crate::worker::{Event, Worker};
 
 /// Why a device cannot be used.

@@ -21,7 +21,6 @@ mod server;
 mod service;
 mod settings;
 mod shapes;
-mod statistics;
 mod worker;
 
 pub use call::{Geometry, Topology};
@@ -33,4 +32,3 @@ pub use potential::PythonPotential;
 pub use self_test::{SelfTestError, SelfTestReport};
 pub use service::DeviceService;
 pub use settings::{PythonDevice, PythonSettings};
-pub use statistics::DeviceStatistics;

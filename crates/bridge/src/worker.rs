@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
+use wire::DeviceStatistics;
 
 use crate::call::{Call, Geometry};
 use crate::description::FeatureForm;
@@ -19,7 +20,6 @@ use crate::self_test::{self, TestSubject};
 use crate::server::{Outstanding, Server, ServerSetup, Synchronous};
 use crate::settings::PythonSettings;
 use crate::shapes::Shape;
-use crate::statistics::DeviceStatistics;
 
 /// A server that fails so many times without an answer in between is given up.
 const MAX_FAILURES: u32 = 3;
@@ -153,6 +153,11 @@ impl Worker {
             device = description.device,
             "python server"
         );
+        {
+            let mut statistics = self.statistics.lock().unwrap_or_else(PoisonError::into_inner);
+            statistics.adapter.clone_from(&description.adapter);
+            statistics.device.clone_from(&description.device);
+        }
         let elements = description.check().map_err(DeviceError::Server)?;
         let dimension = match description.features.form {
             FeatureForm::None => 0,

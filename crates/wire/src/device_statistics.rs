@@ -1,4 +1,4 @@
-//! What a device has done.
+//! What a device that evaluates a model in Python has done, as the store keeps it.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,6 +6,10 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct DeviceStatistics {
+    /// The adapter of the model.
+    pub adapter: String,
+    /// Where it is evaluated.
+    pub device: String,
     /// Batches that were answered.
     pub batches: u64,
     /// Structures in them, without padding.
