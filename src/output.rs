@@ -71,6 +71,12 @@ pub fn decimals(x: Option<f64>, decimals: usize) -> String {
     x.map_or("–".to_owned(), |x| format!("{x:.decimals$}"))
 }
 
+/// A positive number with four significant digits, and at most `most` decimals.
+pub fn four_digits(x: f64, most: usize) -> String {
+    let decimals = (3.0 - x.abs().log10().floor()).clamp(0.0, most as f64) as usize;
+    format!("{x:.decimals$}")
+}
+
 /// A range such as that of a bin. A missing bound leaves it open; without any bound the value is unknown.
 pub fn range(above: Option<f64>, up_to: Option<f64>) -> String {
     match (above, up_to) {
@@ -178,6 +184,12 @@ impl Drop for Bar {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn four_digits_are_enough() {
+        let shown = [2389.227, 41.3333, 1.5, 0.000_123_4].map(|x| four_digits(x, 4));
+        assert_eq!(shown, ["2389", "41.33", "1.500", "0.0001"]);
+    }
 
     #[test]
     fn columns_are_aligned_by_characters() {

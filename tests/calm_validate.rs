@@ -267,9 +267,8 @@ fn sets_are_beside_each_other(output: &Path, found: &Value) {
     let grid = std::fs::read_to_string(output.join("figures/error-grid.svg")).unwrap();
     assert_eq!(grid.matches(": second.extxyz<").count(), 2, "{grid}");
     let page = std::fs::read_to_string(output.join("validation.html")).unwrap();
-    assert!(
-        page.contains("<h2>Further labelled structures</h2>") && page.contains("id=\"figure-reliability-2\"")
-    );
+    assert!(page.contains("second.extxyz</h2>") && page.contains("id=\"figure-reliability-2\""));
+    assert_eq!(page.matches("<h2>Labelled structures of ").count(), 2);
     assert_eq!(page.matches("id=\"reliability-clip-1\"").count(), 1);
 }
 

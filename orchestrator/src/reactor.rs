@@ -82,8 +82,8 @@ pub struct Reactor {
     pub incoming: mpsc::Receiver<Incoming>,
     /// Cancelled to stop, for example by Ctrl-C: walkers are shut down and their walks can be continued later.
     pub stopping: CancellationToken,
-    /// Cancelled when a newer version of the potential is there: the biased walks make room for it.
-    pub superseded: CancellationToken,
+    /// Cancelled when a newer version of the potential is there: biased walks end, to make room for it.
+    pub walks_end: CancellationToken,
     /// Walkers wait while more label jobs than this are unfinished, unless the selector raises its threshold first.
     pub queue_limit: u64,
     /// The newest model of the completion of labels, from the task that learns it. The selector has it before the next
@@ -128,8 +128,8 @@ impl Reactor {
             EventStream::new(self.incoming, self.selector.regrader().clone(), self.selector.mixture());
         let stopping = self.stopping.clone();
         let mut stop = pin!(stopping.cancelled().fuse());
-        let superseded = self.superseded;
-        let mut newer_version = pin!(superseded.cancelled().fuse());
+        let walks_end = self.walks_end;
+        let mut newer_version = pin!(walks_end.cancelled().fuse());
         let mut completion = self.completion;
         let mut state = ReactorState::new(self.selector, self.store, self.stopping, self.queue_limit);
         // An interval, not a timeout since the last message: busy walkers may report progress continuously.

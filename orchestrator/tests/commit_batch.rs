@@ -214,13 +214,13 @@ impl Arrived {
 }
 
 fn reactor(store: &Store, selector: Selector, incoming: mpsc::Receiver<Incoming>) -> Reactor {
-    let [stopping, superseded] = [(); 2].map(|()| CancellationToken::new());
+    let [stopping, walks_end] = [(); 2].map(|()| CancellationToken::new());
     Reactor {
         selector,
         store: store.clone(),
         incoming,
         stopping,
-        superseded,
+        walks_end,
         queue_limit: 100,
         completion: None,
     }

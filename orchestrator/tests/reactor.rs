@@ -95,8 +95,8 @@ async fn reactor(store: &Store, stopping: &CancellationToken) -> (Reactor, mpsc:
     }
     let (to_reactor, incoming) = mpsc::channel(2);
     let (store, stopping, queue_limit) = (store.clone(), stopping.clone(), 1000);
-    let superseded = CancellationToken::new();
-    (Reactor { selector, store, incoming, stopping, superseded, queue_limit, completion: None }, to_reactor)
+    let walks_end = CancellationToken::new();
+    (Reactor { selector, store, incoming, stopping, walks_end, queue_limit, completion: None }, to_reactor)
 }
 
 /// Works on an assignment like a scripted walker: interrupted after a few steps if asked to stop.

@@ -31,7 +31,7 @@ fn sections<'a>(
     sets: &[LabelledSet],
     parts: &'a [page::FigureEntry],
     tables: &'a [page::PageTable],
-) -> Vec<Section<'a>> {
+) -> Vec<(String, Vec<PageBlock<'a>>)> {
     let figure = |name: &str| PageBlock::figure(parts, name);
     let table = |name: &str| PageBlock::table(tables, name);
     let blocks = |blocks: Vec<Option<PageBlock<'a>>>| blocks.into_iter().flatten().collect::<Vec<_>>();
@@ -101,8 +101,15 @@ fn sections<'a>(
         let blocks = figure("error-grid").into_iter().collect();
         sections.push(("Models on the labelled structures", blocks));
     }
-    sections.extend(sets.iter().enumerate().map(|(number, set)| labelled_set(parts, tables, (number, set))));
-    sections
+    let sections = sections.into_iter().map(|(heading, blocks)| (heading.to_owned(), blocks));
+    let of_sets = sets.iter().enumerate().map(|(number, set)| {
+        let heading = match sets.len() {
+            1 => "Labelled structures".to_owned(),
+            _ => format!("Labelled structures of {}", set.file),
+        };
+        (heading, labelled_set(parts, tables, (number, set)))
+    });
+    sections.chain(of_sets).collect()
 }
 
 /// What a set of labelled structures says.
@@ -110,7 +117,7 @@ fn labelled_set<'a>(
     parts: &'a [page::FigureEntry],
     tables: &'a [page::PageTable],
     (number, set): (usize, &LabelledSet),
-) -> Section<'a> {
+) -> Vec<PageBlock<'a>> {
     let figure = |name: &str| PageBlock::figure(parts, &of_set(name, number));
     let table = |name: &str| PageBlock::table(tables, &of_set(name, number));
     let words = format!(
@@ -138,8 +145,7 @@ fn labelled_set<'a>(
         figure("mixture-map"),
         table("mixtures"),
     ];
-    let heading = if number == 0 { "Labelled structures" } else { "Further labelled structures" };
-    (heading, blocks.into_iter().flatten().collect())
+    blocks.into_iter().flatten().collect()
 }
 
 /// The name of a figure or a table of a set of labelled structures, from 0.

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use atoms::{Bond, NeighbourList, Species, Structure};
 use serde::Serialize;
 
-use super::labelled::{LabelledReport, TrainingErrors};
+use super::labelled::TrainingErrors;
 use super::solutions::lattice;
 
 /// Training structures of the pairs of elements.
@@ -69,8 +69,8 @@ impl TrainingCompositions {
     }
 
     /// With the errors, if the structures have labels.
-    pub fn finish(mut self, report: Option<&LabelledReport>) -> Self {
-        self.errors = report.map(TrainingErrors::from);
+    pub fn finish(mut self, errors: Option<TrainingErrors>) -> Self {
+        self.errors = errors;
         for pair in &mut self.pairs {
             let (_, _, shell) = lattice(pair.species);
             let group = |((is_second, neighbours), atoms): (&(bool, usize), &u64)| TrainingShell {

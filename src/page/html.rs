@@ -5,12 +5,12 @@ use std::fmt::Write;
 use figures::{BOLD, REGULAR, escape, to_html, to_svg};
 
 use super::style::grouped;
-use super::{FigureContent, FigureEntry, PageBlock, PageTable, Section, TableCell};
+use super::{FigureContent, FigureEntry, PageBlock, PageTable, TableCell};
 
 const STYLE: &str = include_str!("page.css");
 
-/// Writes a page. Title and lead come above the sections; those without content are left out.
-pub fn write(title: &str, lead: &str, sections: Vec<Section<'_>>) -> String {
+/// Writes a page. Title and lead come above the sections, each with its heading; those without content are left out.
+pub fn write<H: AsRef<str>>(title: &str, lead: &str, sections: Vec<(H, Vec<PageBlock<'_>>)>) -> String {
     let mut html = format!(
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n<title>{}</title>\n<style>\n{}{}{STYLE}</style>\n\
@@ -25,7 +25,7 @@ pub fn write(title: &str, lead: &str, sections: Vec<Section<'_>>) -> String {
         if blocks.is_empty() {
             continue;
         }
-        let _ = writeln!(html, "<section>\n<h2>{}</h2>", escape(heading));
+        let _ = writeln!(html, "<section>\n<h2>{}</h2>", escape(heading.as_ref()));
         for block in blocks {
             match block {
                 PageBlock::Paragraph(words) => {
@@ -46,7 +46,7 @@ fn write_figure(html: &mut String, part: &FigureEntry, number: usize) {
     let _ = match drawn {
         Ok(FigureContent { figure, caption, .. }) => writeln!(
             html,
-            "<figure id=\"figure-{name}\">\n{}<figcaption><strong>Figure {number}. {}.</strong> {} \
+            "<figure id=\"figure-{name}\">\n<div class=\"drawing\">{}</div><figcaption><strong>Figure {number}. {}.</strong> {} \
              <span class=\"files\">Files: figures/{name}.svg, .png, .csv.</span></figcaption>\n</figure>",
             to_svg(figure),
             escape(title),
@@ -69,8 +69,8 @@ fn write_table(html: &mut String, table: &PageTable, number: usize) {
     };
     let _ = writeln!(
         html,
-        "<div class=\"scroll\"><table id=\"table-{name}\">\n<caption><strong>Table {number}.</strong> {}{more} \
-         <span class=\"files\">File: tables/{name}.csv.</span></caption>",
+        "<div class=\"scroll\"><table id=\"table-{name}\">\n<caption><div><strong>Table {number}.</strong> {}{more} \
+         <span class=\"files\">File: tables/{name}.csv.</span></div></caption>",
         to_html(caption)
     );
     let is_number = |k: usize| rows.iter().all(|row| row.get(k).is_some_and(|cell| cell.is_number));
@@ -102,8 +102,22 @@ fn write_cell(column: usize, cell: &TableCell) -> String {
     match (column, cell.is_number) {
         (0, _) => format!("<th scope=\"row\">{shown}</th>"),
         (_, true) => format!("<td class=\"number\">{shown}</td>"),
-        _ => format!("<td class=\"word\">{shown}</td>"),
+        _ => format!("<td class=\"word\">{}</td>", breakable(&shown)),
     }
+}
+
+/// With places for line breaks between the elements of formulas: before an upper-case letter that follows a digit or a letter.
+fn breakable(text: &str) -> String {
+    let mut broken = String::with_capacity(text.len());
+    let mut last = ' ';
+    for next in text.chars() {
+        if next.is_ascii_uppercase() && (last.is_ascii_lowercase() || last.is_ascii_digit()) {
+            broken.push_str("<wbr/>");
+        }
+        broken.push(next);
+        last = next;
+    }
+    broken
 }
 
 /// Embeds a font, so that the page looks the same everywhere.
@@ -133,6 +147,12 @@ fn base64(bytes: &[u8]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn formulas_break_between_elements() {
+        assert_eq!(breakable("Hf2NbO10"), "Hf2<wbr/>Nb<wbr/>O10");
+        assert_eq!(breakable("4 completed, CO &amp; ROC-AUC"), "4 completed, CO &amp; ROC-AUC");
+    }
 
     #[test]
     fn bytes_are_written_in_base_64() {

@@ -76,7 +76,8 @@ pub fn count(number: u64) -> TableCell {
 /// A number with a fixed number of decimals, or a dash.
 pub fn real(x: impl Into<Option<f64>>, decimals: usize) -> TableCell {
     let x = x.into();
-    TableCell { shown: crate::output::decimals(x, decimals), exact: csv::number(x), is_number: true }
+    let shown = crate::output::decimals(x, decimals).replace('-', "−");
+    TableCell { shown, exact: csv::number(x), is_number: true }
 }
 
 /// A share, in percent on the page and in the file.

@@ -45,23 +45,23 @@ pub fn all(data: &ReportData) -> Vec<PageTable> {
     ];
     if let Some(found) = &data.labels {
         tables.extend(comparison::all(&found.comparison));
-    }
-    tables.extend([versions::versions(&data.versions), versions::errors(&data.versions)]);
-    if let Some(found) = &data.labels {
         tables.extend([
             labels::correlations(&found.statistics),
+            labels::energy_offsets(&found.statistics),
             labels::quantiles("quantiles-gamma", "γ", &found.statistics.all.gamma),
             labels::quantiles("quantiles-gamma-nbr", "γ_{nbr}", &found.statistics.all.gamma_nbr),
             calibration::bounds("error-bounds", &found.calibration.summary().found),
             calibration::by_value(&found.calibration.summary()),
-            versions::grades(&found.statistics),
-            labels::energy_offsets(&found.statistics),
-            labels::failures(&found.failures),
-            labels::unlabelled(&found.unlabelled),
         ]);
     }
-    if let Some(found) = data.labels.as_ref().and_then(|labels| labels.completion.as_ref()) {
-        tables.extend([completion_model::coefficients(found), completion_model::reliability(found)]);
+    tables.extend([versions::versions(&data.versions), versions::errors(&data.versions)]);
+    if let Some(found) = &data.labels {
+        tables.extend([versions::grades(&found.statistics), labels::failures(&found.failures)]);
+        if let Some(completion) = &found.completion {
+            let reliability = completion_model::reliability(completion);
+            tables.extend([completion_model::coefficients(completion), reliability]);
+        }
+        tables.push(labels::unlabelled(&found.unlabelled));
     }
     tables.extend([settings::settings(data), facts::provenance(data)]);
     tables.retain(|table| !table.rows.is_empty());

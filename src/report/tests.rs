@@ -10,6 +10,7 @@ use wire::messages::{DeclineReason, WalkProgress};
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
 use super::*;
+use crate::wording::comparison;
 
 const CAMPAIGN: CampaignId = CampaignId([7; 16]);
 const ATOMS: usize = 8;
@@ -118,6 +119,17 @@ fn file<'a>(files: &'a [PageFile], path: &str) -> &'a str {
     std::str::from_utf8(&file.unwrap_or_else(|| panic!("no {path}")).bytes).unwrap()
 }
 
+/// Checks that every table is on the page, in the order of their numbers.
+fn are_on_the_page(files: &[PageFile]) {
+    let page = file(files, PAGE);
+    let mut places = Vec::new();
+    for table in files.iter().filter_map(|file| file.path.strip_prefix("tables/")?.strip_suffix(".csv")) {
+        let place = page.find(&format!("<table id=\"table-{table}\">"));
+        places.push(place.unwrap_or_else(|| panic!("{table} is not on the page")));
+    }
+    assert!(places.len() > 3 && places.is_sorted(), "{places:?}");
+}
+
 #[tokio::test]
 async fn every_setting_is_on_the_page() {
     let directory = tempfile::tempdir().unwrap();
@@ -186,6 +198,7 @@ async fn figures_have_the_numbers_of_the_store() {
     }
     let page = file(&files, PAGE);
     words(page);
+    are_on_the_page(&files);
     assert!(
         !page.contains("http://") || page.matches("http://").count() == 9,
         "only names of SVG's elements"
@@ -275,7 +288,27 @@ async fn biased_walks_are_compared_with_their_controls() {
         points.contains("a,0,0,19,,") && points.contains("\na median,") && points.contains("\nb,,,,0.1,")
     );
     words(file(&files, "figures/pairs.svg"));
+    names_are_those_of_the_json(&store).await;
     assert!(!files.iter().any(|file| file.path == "tables/elements.csv"), "there is one element");
+}
+
+/// The dashboard finds errors and groups in the JSON of the comparison by the keys that come with their names.
+async fn names_are_those_of_the_json(store: &Store) {
+    let statistics = monitor::label_statistics::read(store, ContentHash([3; 32]), None).await.unwrap();
+    let compared = statistics.comparison();
+    let (json, shown) = (json!(compared), comparison::shown());
+    let groups = comparison::groups(&compared);
+    let is_named = |name: &str| groups.iter().find(|(of, _)| *of == name).map(|(_, group)| json!(group));
+    for group in shown["groups"].as_array().unwrap() {
+        let [kind, walks] = [0, 1].map(|k| group["place"][k].as_str().unwrap());
+        assert_eq!(is_named(group["name"].as_str().unwrap()).unwrap(), json[kind][walks]);
+    }
+    let errors = comparison::known_errors(&compared.pairs);
+    assert_eq!(errors.len(), 3, "there is no stress");
+    for (error, quantity) in errors {
+        assert_eq!(json!(quantity), json["pairs"][error.key]);
+    }
+    assert_eq!(shown["errors"][0]["key"], "force_mae");
 }
 
 /// A walk with this number and version of the potential.
@@ -337,6 +370,7 @@ async fn versions_are_shown_apart_from_each_other() {
     {
         assert!(page.contains(expected), "{expected}: {page}");
     }
+    are_on_the_page(&files);
     let features = file(&files, "figures/features.csv");
     assert!(features.contains("Al,control") && !features.contains("Al,biased"), "{features}");
     let correlations = file(&files, "tables/correlations.csv");

@@ -23,7 +23,10 @@ fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [PageTa
     });
     vec![
         ("Summary", blocks(vec![table("summary"), table("forgetting"), table("forgetting-components")])),
-        ("Collected structures", blocks(vec![why, numbered("collection"), table("seed-structures")])),
+        (
+            "Collected structures",
+            blocks(vec![why, numbered("collection"), table("conditions"), table("seed-structures")]),
+        ),
         (
             "Biased against control walks",
             blocks(vec![
@@ -46,6 +49,7 @@ fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [PageTa
             blocks(vec![
                 numbered("grades"),
                 table("correlations"),
+                table("energy-offsets"),
                 table("quantiles-gamma"),
                 table("quantiles-gamma-nbr"),
                 numbered("error-bounds"),

@@ -134,7 +134,7 @@ fn start_reactor(
         store: run.store.clone().with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT),
         incoming,
         stopping,
-        superseded: run.walks_end.clone(),
+        walks_end: run.walks_end.clone(),
         queue_limit,
         completion,
     };

@@ -5,6 +5,8 @@ use monitor::label_statistics::comparison::{
     ComparedGroup, ConfidenceEstimate, ElementRanking, MIN_UNITS, PairCounts, PairedErrors, PairedQuantity,
     PairedTests, ResampledUnit, ResamplingUnits, WalkComparison,
 };
+use serde::Serialize;
+use serde_json::{Value, json};
 
 use crate::output::{count, decimals};
 
@@ -125,44 +127,127 @@ fn sampled(comparison: &WalkComparison) -> Option<String> {
     })
 }
 
-/// An error over the pairs with its name and unit, the factor to this unit, and the number of decimals.
-pub type ShownError<'a> = (&'static str, &'a PairedQuantity, f64, usize);
-
-/// The errors that are known of any pairs.
-pub fn known_errors(pairs: &PairedErrors) -> Vec<ShownError<'_>> {
-    let mut all = vec![
-        ("force MAE (eV/Å)", &pairs.force_mae, 1.0, 3),
-        ("mean |ΔF| (eV/Å)", &pairs.mean_force_error, 1.0, 3),
-        ("energy error (meV/atom)", &pairs.energy, 1000.0, 1),
-        ("stress error (GPa)", &pairs.stress, GPA_PER_EV_A3, 3),
-    ];
-    all.retain(|(_, quantity, ..)| quantity.pairs > 0);
-    all
+/// An error over the pairs as views show it.
+#[derive(Clone, Copy, Serialize)]
+pub struct ShownError {
+    /// Its name and unit.
+    pub name: &'static str,
+    /// Its key in the JSON of the pairs.
+    pub key: &'static str,
+    /// Factor to its unit.
+    pub factor: f64,
+    /// Number of decimals.
+    pub digits: usize,
+    #[serde(skip)]
+    of: fn(&PairedErrors) -> &PairedQuantity,
 }
 
-/// The groups with structures by name: matched, then pooled.
+/// A group of structures as views show it.
+#[derive(Clone, Copy, Serialize)]
+pub struct ShownGroup {
+    /// Its name.
+    pub name: &'static str,
+    /// Its keys in the JSON of the comparison.
+    pub place: [&'static str; 2],
+    /// Whether views show its elements.
+    pub by_element: bool,
+    #[serde(skip)]
+    of: fn(&WalkComparison) -> &ComparedGroup,
+}
+
+/// All errors, in the order in which they are shown.
+const ERRORS: [ShownError; 4] = [
+    ShownError {
+        name: "force MAE (eV/Å)",
+        key: "force_mae",
+        factor: 1.0,
+        digits: 3,
+        of: |pairs| &pairs.force_mae,
+    },
+    ShownError {
+        name: "mean |ΔF| (eV/Å)",
+        key: "mean_force_error",
+        factor: 1.0,
+        digits: 3,
+        of: |pairs| &pairs.mean_force_error,
+    },
+    ShownError {
+        name: "energy error (meV/atom)",
+        key: "energy",
+        factor: 1000.0,
+        digits: 1,
+        of: |pairs| &pairs.energy,
+    },
+    ShownError {
+        name: "stress error (GPa)",
+        key: "stress",
+        factor: GPA_PER_EV_A3,
+        digits: 3,
+        of: |pairs| &pairs.stress,
+    },
+];
+
+/// All groups: matched, then pooled.
+const GROUPS: [ShownGroup; 5] = [
+    ShownGroup {
+        name: "matched biased",
+        place: ["matched", "biased"],
+        by_element: true,
+        of: |all| &all.matched.biased,
+    },
+    ShownGroup {
+        name: "matched control",
+        place: ["matched", "control"],
+        by_element: true,
+        of: |all| &all.matched.control,
+    },
+    ShownGroup { name: "pooled all", place: ["pooled", "all"], by_element: true, of: |all| &all.pooled.all },
+    ShownGroup {
+        name: "pooled biased",
+        place: ["pooled", "biased"],
+        by_element: false,
+        of: |all| &all.pooled.biased,
+    },
+    ShownGroup {
+        name: "pooled control",
+        place: ["pooled", "control"],
+        by_element: false,
+        of: |all| &all.pooled.control,
+    },
+];
+
+/// What views show of the JSON of a comparison: errors of `pairs` if there are pairs with them, groups if they have structures.
+pub fn shown() -> Value {
+    json!({ "errors": ERRORS, "groups": GROUPS })
+}
+
+/// The errors that are known of any pairs.
+pub fn known_errors(pairs: &PairedErrors) -> Vec<(ShownError, &PairedQuantity)> {
+    let all = ERRORS.into_iter().map(|error| (error, (error.of)(pairs)));
+    all.filter(|(_, quantity)| quantity.pairs > 0).collect()
+}
+
+/// The groups with structures by name.
 pub fn groups(comparison: &WalkComparison) -> Vec<(&'static str, &ComparedGroup)> {
-    let (matched, pooled) = (&comparison.matched, &comparison.pooled);
-    let mut all = vec![
-        ("matched biased", &matched.biased),
-        ("matched control", &matched.control),
-        ("pooled all", &pooled.all),
-        ("pooled biased", &pooled.biased),
-        ("pooled control", &pooled.control),
-    ];
-    all.retain(|(_, group)| group.structures > 0);
-    all
+    shown_groups(comparison).map(|(shown, group)| (shown.name, group)).collect()
+}
+
+fn shown_groups(comparison: &WalkComparison) -> impl Iterator<Item = (ShownGroup, &ComparedGroup)> {
+    let all = GROUPS.into_iter().map(|shown| (shown, (shown.of)(comparison)));
+    all.filter(|(_, group)| group.structures > 0)
 }
 
 /// The elements of matched structures and of all, with the name of their group; none if all groups have one element.
 pub fn elements(comparison: &WalkComparison) -> Vec<(&'static str, &ElementRanking)> {
-    let mut groups = groups(comparison);
-    groups.retain(|(name, _)| name.starts_with("matched") || *name == "pooled all");
+    let groups = shown_groups(comparison).filter(|(shown, _)| shown.by_element);
+    let groups: Vec<_> = groups.map(|(shown, group)| (shown.name, group)).collect();
     if groups.iter().all(|(_, group)| group.elements.len() < 2) {
         return Vec::new();
     }
-    let mut all: Vec<_> =
-        groups.iter().flat_map(|(name, group)| group.elements.iter().map(move |of| (*name, of))).collect();
+    let mut all: Vec<_> = groups
+        .into_iter()
+        .flat_map(|(name, group)| group.elements.iter().map(move |of| (name, of)))
+        .collect();
     // Stable: the groups of an element stay in order.
     all.sort_by_key(|(_, of)| of.element);
     all

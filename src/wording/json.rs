@@ -32,6 +32,13 @@ pub fn force_errors(statistics: &LabelStatistics, protocol: &Protocol) -> Value 
     json
 }
 
+/// The same for the page of errors of the dashboard, with the names of what it shows.
+pub fn force_errors_for_page(statistics: &LabelStatistics, protocol: &Protocol) -> Value {
+    let mut json = force_errors(statistics, protocol);
+    json["biased_against_control"]["shown"] = comparison::shown();
+    json
+}
+
 /// Bounds of the force error in the JSON of `calmwalk force-errors`, with the sentence that views show.
 pub fn error_bounds(summary: &CalibrationSummary) -> Value {
     let mut json = serde_json::to_value(summary).unwrap_or_default();

@@ -9,11 +9,11 @@ use crate::rules::{CovarianceUpdateKind, UpdateGoal, UpdateSettings, count_above
 use crate::update::{Batch, CovarianceUpdate, UpdateError};
 
 /// Maximum factor of a scatter in one round of inflation.
-pub const INFLATION_LIMIT: f64 = 4.0;
+const INFLATION_LIMIT: f64 = 4.0;
 /// Maximum number of rounds of inflation.
 pub const INFLATION_ROUNDS: usize = 3;
 /// Inflation aims at this fraction of the target.
-pub const INFLATION_AIM: f64 = 0.95;
+const INFLATION_AIM: f64 = 0.95;
 
 /// Where a grade of a fast trial is relatively closer to a threshold than this, the direct inverse decides.
 const DECISION_MARGIN: f64 = 1e-5;
@@ -108,8 +108,8 @@ pub fn update(
     })
 }
 
-/// The bounded inflation: at most three rounds of scatter ← min(4, (γ_max / 0.95 target)²) · scatter on every
-/// component that the structure touches, while γ_max ≥ target.
+/// The bounded inflation: at most three rounds of scatter ← [`inflation_factor`] · scatter on every component that the structure
+/// touches, while γ_max ≥ target.
 ///
 /// `changed` are the components after the last trial. Returns the inflated components and the factors. It is public
 /// because tests compare it alone with the reference.
@@ -127,11 +127,16 @@ pub fn inflate(
         if gamma_max < target {
             break;
         }
-        let factor = (gamma_max / (INFLATION_AIM * target)).powi(2).min(INFLATION_LIMIT);
+        let factor = inflation_factor(gamma_max, target);
         changed = batch.inflated(&changed, factor)?;
         factors.push(factor);
     }
     Ok((changed, factors))
+}
+
+/// Factor of the scatter in one round of inflation, min(4, (γ_max / 0.95 target)²).
+pub(crate) fn inflation_factor(gamma_max: f64, target: f64) -> f64 {
+    (gamma_max / (INFLATION_AIM * target)).powi(2).min(INFLATION_LIMIT)
 }
 
 /// Tries α in order until the goal is met. If none meets it, a goal without a limit gives `InflationExhausted`.

@@ -56,13 +56,13 @@ pub async fn lead(plan: Plan) {
         stop.cancel();
     });
     let stopping = tokens.stopping;
-    let superseded = CancellationToken::new();
+    let walks_end = CancellationToken::new();
     let reactor = Reactor {
         selector,
         store: store.clone(),
         incoming,
         stopping,
-        superseded,
+        walks_end,
         queue_limit: u64::MAX,
         completion: None,
     };

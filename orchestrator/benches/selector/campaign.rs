@@ -149,7 +149,7 @@ pub async fn run(
         store: store.clone(),
         incoming,
         stopping: CancellationToken::new(),
-        superseded: CancellationToken::new(),
+        walks_end: CancellationToken::new(),
         queue_limit: u64::MAX,
         completion: None,
     };

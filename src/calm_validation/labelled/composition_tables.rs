@@ -1,7 +1,8 @@
 //! Tables of errors and scores by element and by composition.
 
-use super::report::{ErrorSpread, LabelledReport, ScoreReport};
-use crate::page::{PageTable, TableCell, count, percent, real, text};
+use super::report::{ErrorSpread, LabelledReport};
+use super::tables::name;
+use crate::page::{PageTable, count, percent, real, text};
 
 /// By element and score; without rows if there is only one element.
 pub fn elements(report: &LabelledReport) -> PageTable {
@@ -70,9 +71,4 @@ pub fn compositions(report: &LabelledReport) -> PageTable {
         }
     }
     table
-}
-
-/// The name of a score without markup.
-fn name(score: &ScoreReport) -> TableCell {
-    text(::figures::plain(&score.name))
 }

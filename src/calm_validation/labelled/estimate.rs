@@ -13,7 +13,7 @@ use super::collect::{LabelledErrors, SampledAtom, SampledStructure};
 use super::report::{
     BootstrapSettings, Confident, ElementAuc, IntervalEstimate, LabelledReport, ScoreReport,
 };
-use super::report::{ErrorHistograms, MeanErrors};
+use super::report::{ErrorHistograms, MeanErrors, TrainingErrors};
 
 /// Intervals that hold the true value with a probability of 95 %.
 pub const BOOTSTRAP: Bootstrap = Bootstrap { draws: 1000, level: 0.95, seed: 1 };
@@ -61,6 +61,16 @@ impl LabelledErrors {
             elements: compositions::by_element(&sampled, &self.columns),
             compositions: compositions::by_composition(&sampled, &of_structures, &self.columns),
         }
+    }
+
+    /// The mean errors alone, of the sample; `None` without labels.
+    pub fn training_errors(&self) -> Option<TrainingErrors> {
+        let sampled: Vec<_> = self.sample.items().collect();
+        let structures = StructureStatistics::new(&sampled);
+        let [_, energy, ..] = structures.sums(&vec![1; structures.len()]);
+        let errors: Vec<f64> = self.atoms.items().map(|atom| atom.error).collect();
+        let force = (!errors.is_empty()).then(|| errors.iter().sum::<f64>() / errors.len() as f64);
+        (self.structures > 0).then(|| TrainingErrors { energy: energy.mean_absolute(), force })
     }
 
     /// Of energy with and without offsets, forces and stress. Those of energies without offsets are of the sample only.

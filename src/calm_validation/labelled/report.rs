@@ -226,19 +226,12 @@ pub struct TrainingErrors {
     pub force: Option<f64>,
 }
 
-impl From<&LabelledReport> for TrainingErrors {
-    fn from(report: &LabelledReport) -> Self {
-        let (sum, atoms) = report.elements.iter().fold((0.0, 0), |(sum, atoms), element| {
-            (sum + element.atoms as f64 * element.forces.mean, atoms + element.atoms)
-        });
-        Self {
-            energy: report.energy_without_offsets.mean_absolute.value,
-            force: (atoms > 0).then(|| sum / atoms as f64),
-        }
-    }
-}
-
 impl LabelledReport {
+    /// γ_nbr, the second of the scores: γ and γ_nbr come before all others.
+    pub fn average(&self) -> Option<&ScoreReport> {
+        self.scores.get(1)
+    }
+
     /// The index of a threshold.
     pub fn threshold(&self, threshold: f64) -> Option<usize> {
         self.thresholds.iter().position(|found| *found == threshold)

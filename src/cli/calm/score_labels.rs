@@ -10,7 +10,7 @@ use super::score_table::ScoreTable;
 use super::scorer::Scorer;
 use crate::atomic_file::{AtomicFile, cannot_create, cannot_write};
 use crate::calm_validation::labelled::{
-    self, BOOTSTRAP, LabelledErrors, LabelledReport, LabelledStructure, ScoreColumn,
+    self, BOOTSTRAP, LabelledErrors, LabelledReport, LabelledStructure, ScoreColumn, TrainingErrors,
 };
 use crate::cli::CommandError;
 use crate::output::{count, log_and_warn, print};
@@ -101,16 +101,16 @@ impl ScoreLabels {
         })
     }
 
-    /// Whether a structure had a label that the model predicts.
-    pub fn has_labels(&self) -> bool {
-        self.errors.structures() > 0
+    /// The mean errors alone; `None` without a label that the model predicts.
+    pub fn training_errors(&self) -> Option<TrainingErrors> {
+        self.errors.training_errors()
     }
 
     /// The statistics, which need a label.
     ///
     /// # Errors
     /// No label that the model predicts.
-    pub fn report(self, input: &Path) -> Result<LabelledReport, CommandError> {
+    pub fn report(mut self, input: &Path) -> Result<LabelledReport, CommandError> {
         self.warn(input);
         if self.errors.structures() == 0 {
             return Err(CommandError::Input(format!(
@@ -121,9 +121,10 @@ impl ScoreLabels {
         Ok(self.errors.report(BOOTSTRAP))
     }
 
-    fn warn(&self, input: &Path) {
-        if let (number, Some(first)) = &self.unreadable {
-            let frames = count(*number, "frame");
+    /// Warns of the labels of `input` that could not be read. Frames that are added from then on are those of another file.
+    pub fn warn(&mut self, input: &Path) {
+        if let (number, Some(first)) = std::mem::take(&mut self.unreadable) {
+            let frames = count(number, "frame");
             let place = input.display();
             log_and_warn(format_args!("{place}: no statistics of the labels of {frames}: {first}"));
         }

@@ -20,9 +20,6 @@ use crate::xyz_reader::XyzReader;
 
 const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
-/// Place of γ_nbr among the scores.
-const AVERAGE: usize = 1;
-
 /// A mixture with its file and its features: those of the model, or of another one.
 pub struct NamedMixture {
     pub file: PathBuf,
@@ -68,9 +65,8 @@ pub fn set(
     }
     for by in comparison.models {
         let Some(report) = graded(by)? else { return Ok(None) };
-        let average = report.scores.into_iter().nth(AVERAGE);
         let model = by.file.display().to_string();
-        models.extend(average.map(|average| ComparedModel { model, average }));
+        models.extend(report.average().cloned().map(|average| ComparedModel { model, average }));
     }
     Ok(Some(LabelledSet { file: input.display().to_string(), report, mixtures, models }))
 }
@@ -119,9 +115,9 @@ pub fn training(
         if !each_frame(input, scorer, stop, add)? {
             return Ok(None);
         }
+        labels.warn(input);
     }
-    let report = inputs.first().filter(|_| labels.has_labels()).map(|input| labels.report(input));
-    Ok(Some(training.finish(report.transpose()?.as_ref())))
+    Ok(Some(training.finish(labels.training_errors())))
 }
 
 /// Why a frame was not added.

@@ -8,7 +8,7 @@ use monitor::label_statistics::comparison::{ComparedGroup, PairedErrors, PairedQ
 
 use crate::output::{TextTable, decimals};
 use crate::wording::comparison::{
-    elements, estimate, groups, known_errors, larger, median_range, notes, probability,
+    ShownError, elements, estimate, groups, known_errors, larger, median_range, notes, probability,
 };
 
 /// Writes the section; nothing without labelled structures.
@@ -44,7 +44,7 @@ fn write_pairs(out: &mut dyn Write, pairs: &PairedErrors) -> io::Result<()> {
         ">Wilcoxon p",
         ">sign test p",
     ]);
-    for (name, quantity, factor, places) in known_errors(pairs) {
+    for (ShownError { name, factor, digits: places, .. }, quantity) in known_errors(pairs) {
         let PairedQuantity { biased, control, difference_of_medians, tests, .. } = quantity;
         table.push(vec![
             name.into(),

@@ -8,6 +8,7 @@ use super::super::report_data::ReportData;
 use super::super::style::{WIDTH, axis, grouped};
 use super::super::{Csv, FigureContent, csv};
 use super::row;
+use crate::output::four_digits;
 
 /// Bins of the histogram.
 const BINS: usize = 24;
@@ -62,13 +63,13 @@ fn size(costs: &[LabelCost]) -> (&'static str, fn(&LabelCost) -> f64) {
 
 fn caption(data: &ReportData, mut seconds: Vec<f64>) -> String {
     seconds.sort_by(f64::total_cmp);
-    let of = |share| quantile(&seconds, share).map_or(String::new(), |x| format!("{x:.3}"));
+    let of = |share| quantile(&seconds, share).map_or(String::new(), |x| four_digits(x, 3));
     format!(
         "Core-seconds of successful label attempts (n = {}): median {}, 90 % quantile {}. a, Distribution. b, By size. Failed attempts \
-         are not shown; all attempts together took {:.4} core-hours.",
+         are not shown; all attempts together took {} core-hours.",
         grouped(seconds.len() as u64),
         of(0.5),
         of(0.9),
-        data.status.budget.used.core_hours
+        four_digits(data.status.budget.used.core_hours, 4)
     )
 }

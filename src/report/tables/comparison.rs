@@ -3,7 +3,7 @@
 use analysis::ERROR_THRESHOLDS;
 use monitor::label_statistics::LARGE_FORCE_ERROR;
 use monitor::label_statistics::comparison::{
-    ConfidenceEstimate, PairedErrors, PairedQuantity, WalkComparison,
+    ConfidenceEstimate, MIN_UNITS, PairedErrors, PairedQuantity, WalkComparison,
 };
 
 use super::{PageTable, TableCell, count, real, text};
@@ -36,7 +36,7 @@ fn pairs(comparison: &WalkComparison) -> PageTable {
         intervals(&comparison.pairs.units, comparison)
     );
     let mut table = PageTable::new("pairs", &caption, &["error", "of", "pairs", "median", INTERVAL]);
-    for (name, quantity, factor, digits) in wording::known_errors(&comparison.pairs) {
+    for (error, quantity) in wording::known_errors(&comparison.pairs) {
         let PairedQuantity { biased, control, difference_of_medians, median_difference, .. } = quantity;
         for (of, estimate) in [
             ("biased", biased),
@@ -44,8 +44,8 @@ fn pairs(comparison: &WalkComparison) -> PageTable {
             ("difference of medians", difference_of_medians),
             ("difference within pairs", median_difference),
         ] {
-            let mut row = vec![text(name), text(of), count(quantity.pairs)];
-            row.extend(cells(estimate, factor, digits));
+            let mut row = vec![text(error.name), text(of), count(quantity.pairs)];
+            row.extend(cells(estimate, error.factor, error.digits));
             table.rows.push(row);
         }
     }
@@ -67,8 +67,8 @@ fn tests(pairs: &PairedErrors) -> PageTable {
         "sign test p",
     ];
     let mut table = PageTable::new("pair-tests", caption, &titles);
-    for (name, quantity, ..) in wording::known_errors(pairs) {
-        let mut row = vec![text(name)];
+    for (error, quantity) in wording::known_errors(pairs) {
+        let mut row = vec![text(error.name)];
         for tests in [&quantity.tests, &quantity.tests_by_unit] {
             row.push(text(larger(tests)));
             row.extend([tests.wilcoxon_p, tests.sign_p].map(probability_cell));
@@ -153,7 +153,8 @@ fn groups(comparison: &WalkComparison) -> PageTable {
 fn ranks(comparison: &WalkComparison) -> PageTable {
     let caption = format!(
         "How well the grades under the original mixture rank the force errors of atoms, in the groups of the table before: Spearman’s ρ, and \
-         ROC-AUC for errors above {LARGE_FORCE_ERROR} eV Å^{{−1}}."
+         ROC-AUC for errors above {LARGE_FORCE_ERROR} eV Å^{{−1}}. No interval where fewer than {MIN_UNITS} of the resampled units have such \
+         an error."
     );
     let titles = ["", "grade", "sampled atoms", "ρ", INTERVAL, "ROC-AUC", INTERVAL];
     let mut table = PageTable::new("comparison-ranks", &caption, &titles);
@@ -170,8 +171,11 @@ fn ranks(comparison: &WalkComparison) -> PageTable {
 
 /// The ROC-AUC of γ_nbr for every threshold of the force error with large and small errors.
 fn areas(comparison: &WalkComparison) -> PageTable {
-    let caption = "ROC-AUC of γ_{nbr} under the original mixture as a test for force errors above a threshold, for each threshold with \
-                   errors on both sides, in the groups of the table of medians.";
+    let caption = format!(
+        "ROC-AUC of γ_{{nbr}} under the original mixture as a test for force errors above a threshold, for each threshold with errors on \
+         both sides, in the groups of the table of medians. No interval where fewer than {MIN_UNITS} of the resampled units have such an \
+         error."
+    );
     let titles = [
         "threshold (eV Å^{−1})",
         "matched biased",
@@ -181,7 +185,7 @@ fn areas(comparison: &WalkComparison) -> PageTable {
         "pooled all",
         INTERVAL,
     ];
-    let mut table = PageTable::new("auc-by-threshold", caption, &titles);
+    let mut table = PageTable::new("auc-by-threshold", &caption, &titles);
     let groups = [&comparison.matched.biased, &comparison.matched.control, &comparison.pooled.all];
     for (place, threshold) in ERROR_THRESHOLDS.iter().enumerate() {
         let of = groups.map(|group| group.gamma_nbr.roc_auc.get(place).copied().unwrap_or_default());
@@ -197,7 +201,7 @@ fn areas(comparison: &WalkComparison) -> PageTable {
 fn elements(comparison: &WalkComparison) -> PageTable {
     let caption = format!(
         "The atoms of each element: median force error, and how well the grades rank it (ROC-AUC for errors above {LARGE_FORCE_ERROR} eV \
-         Å^{{−1}}). Intervals where enough of the resampled units have the element."
+         Å^{{−1}}). No interval where fewer than {MIN_UNITS} of the resampled units have the element, or such an error of it."
     );
     let titles = [
         "element",

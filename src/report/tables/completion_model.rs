@@ -7,7 +7,7 @@ use super::{PageTable, count, real, text};
 /// Coefficients. Without rows if there are too few finished labels to learn from.
 pub fn coefficients(found: &CompletionReport) -> PageTable {
     let caption = format!(
-        "Logistic regression of the completion of labels (n = {}, {} failed) on the largest γ under the original mixture, V/V_{{0}}, the \
+        "Logistic regression of the completion of the newest labels (n = {}, {} failed) on the largest γ under the original mixture, V/V_{{0}}, the \
          shortest distance relative to the sum of covalent radii, and fractions of elements: coefficients per unit of each, with a ridge \
          penalty.",
         found.finished, found.failed

@@ -9,7 +9,7 @@ use super::Dashboard;
 use super::response::{ApiError, ApiResult};
 use crate::wording;
 
-/// `GET /api/errors`: what `calmwalk force-errors --json` prints.
+/// `GET /api/errors`: what `calmwalk force-errors --json` prints, and the names of what the page shows of it.
 pub async fn force_errors(State(dashboard): State<Dashboard>) -> ApiResult {
     dashboard.errors.get_or_compute(compute(dashboard.store)).await
 }
@@ -22,7 +22,7 @@ async fn compute(store: Store) -> Result<String, ApiError> {
     let bounds = calibration::read(&store, protocol.hash, statistics.version.unwrap_or(0)).await?;
     // The intervals may take seconds.
     let json = move || {
-        let mut json = wording::json::force_errors(&statistics, &protocol);
+        let mut json = wording::json::force_errors_for_page(&statistics, &protocol);
         json["calibration"] = wording::json::error_bounds(&bounds.summary());
         json.to_string()
     };

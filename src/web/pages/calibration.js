@@ -1,17 +1,23 @@
 // Bounds of the force error by grade, and how often they held.
 
 import { LINES } from "./colours.js";
-import { element, sentence, table } from "./dom.js";
-import { decimals, percent, range, whole } from "./format.js";
+import { element, table } from "./dom.js";
+import { decimals, percent, range, statement, whole } from "./format.js";
 import { plot } from "./plot.js";
 
 /** The sentence, a plot, and a table of the bins; a second table of labels by value, which are fitted apart. */
 export function errorBounds({ note, found, by_value: byValue }) {
-  const parts = [element("p", {}, sentence(note), ".")];
+  const parts = [element("p", {}, statement(note))];
   if (found.bins.some((bin) => bin.bound != null)) parts.push(element("div", { class: "plots" }, figure(found)));
-  if (found.bins.length > 0) parts.push(bins("Bounds of the force error by γ_nbr", found));
+  if (found.bins.length > 0) {
+    parts.push(element("p", {}, `A bound follows from the newest ${whole(found.window_structures)} structures of a bin, and needs `
+      + `${whole(found.least_structures)}. Held: mean share of a structure’s atoms below the bounds from before its label came, over the newest `
+      + "structures (tested by). Level in force: the level that has made bounds hold as often as they should."),
+    bins("Bounds of the force error by γ_nbr", found));
+  }
   if (byValue) {
-    parts.push(element("p", {}, "From labels of structures that the queue chose by value:"), bins("Bounds of the force error from labels by value", byValue));
+    parts.push(element("p", {}, "From labels of structures that the queue chose by value, which prefers large errors:"),
+      bins("Bounds of the force error from labels by value", byValue));
   }
   return parts;
 }

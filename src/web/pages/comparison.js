@@ -2,24 +2,22 @@
 
 import { LINES } from "./colours.js";
 import { element, section, sentence, table } from "./dom.js";
-import { decimals, tick, whole } from "./format.js";
+import { decimals, statement, tick, whole } from "./format.js";
 import { plot } from "./plot.js";
-
-/** 1 eV/Å³ in GPa. */
-const GPA = 160.2176634;
 
 /** The section; nothing without labelled structures. */
 export function comparison({ biased_against_control: compared, large }) {
   if (!compared || compared.pooled.all.structures === 0) return "";
-  const { matched, pooled, pairs, thresholds } = compared;
-  const groups = [["matched biased", matched.biased], ["matched control", matched.control], ["pooled all", pooled.all],
-    ["pooled biased", pooled.biased], ["pooled control", pooled.control]].filter(([, group]) => group.structures > 0);
-  const both = groups.filter(([name]) => name.startsWith("matched") || name === "pooled all");
+  const { pairs, thresholds, shown } = compared;
+  const withStructures = shown.groups.filter(({ place: [kind, walks] }) => compared[kind][walks].structures > 0);
+  const named = ({ name, place: [kind, walks] }) => [name, compared[kind][walks]];
+  const groups = withStructures.map(named);
+  const both = withStructures.filter((group) => group.by_element).map(named);
   return section("Biased against control",
     element("p", {}, "Matched: a labelled candidate of a biased walk and the labelled frame of its control walk at the same step. Pooled: all "
       + "labelled structures, with a partner or without."),
-    element("ul", {}, compared.notes.map((note) => element("li", {}, `${note}.`))),
-    pairs.counts.pairs > 0 && pairTable(pairs), ranges(pairs), groupTable(groups),
+    element("ul", {}, compared.notes.map((note) => element("li", {}, statement(note)))),
+    pairs.counts.pairs > 0 && pairTable(pairs, shown.errors), ranges(pairs), groupTable(groups),
     rankTable(groups, thresholds.indexOf(large), large), areas(both, thresholds), elementTable(both, large));
 }
 
@@ -34,12 +32,11 @@ function probability(p) {
   return p != null && p < 1e-3 ? p.toExponential(1).replace("-", "−") : decimals(p, 3);
 }
 
-function pairTable(pairs) {
+function pairTable(pairs, errors) {
   const columns = [["median over the pairs"], ["pairs", true], ["biased", true], ["control", true], ["difference of medians", true],
     ["biased larger in", true], ["Wilcoxon p", true], ["sign test p", true]];
-  const quantities = [["force MAE (eV/Å)", pairs.force_mae, 3, 1], ["mean |ΔF| (eV/Å)", pairs.mean_force_error, 3, 1],
-    ["energy error (meV/atom)", pairs.energy, 1, 1000], ["stress error (GPa)", pairs.stress, 3, GPA]];
-  const rows = quantities.filter(([, of]) => of.pairs > 0).map(([name, of, digits, factor]) => [sentence(name), whole(of.pairs),
+  const known = errors.map((error) => ({ ...error, of: pairs[error.key] })).filter(({ of }) => of.pairs > 0);
+  const rows = known.map(({ name, of, digits, factor }) => [sentence(name), whole(of.pairs),
     estimate(of.biased, digits, factor), estimate(of.control, digits, factor), estimate(of.difference_of_medians, digits, factor),
     `${of.tests.biased_larger} of ${of.tests.biased_larger + of.tests.control_larger}`, probability(of.tests.wilcoxon_p),
     probability(of.tests.sign_p)]);

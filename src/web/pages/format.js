@@ -72,3 +72,6 @@ export function ago(milliseconds) {
 export function shortName(id) {
   return id.replace(/^[0-9a-f]{8}-/, "").replace(/-[0-9a-f]{16}$/, "");
 }
+
+/** A note of the program as a sentence of its own. */
+export const statement = (note) => `${note.charAt(0).toUpperCase()}${note.slice(1)}.`;

@@ -12,7 +12,7 @@ use crate::grade::{DISTANCE_FLOOR, GradeError, THRESHOLD_FLOOR, maximum};
 use crate::linear::{LinearError, product, regularised_factor, symmetrised, view};
 use crate::mixture::Mixture;
 use crate::rules::CovarianceUpdateKind;
-use crate::search::{INFLATION_AIM, INFLATION_LIMIT, INFLATION_ROUNDS};
+use crate::search::{INFLATION_ROUNDS, inflation_factor};
 use crate::update::UpdateError;
 
 /// The components that atoms of a pool belong to. Centroids, thresholds and the assignment of atoms do not change.
@@ -121,7 +121,7 @@ impl LearnedMixture {
             if update.gamma_max < self.target {
                 break;
             }
-            let factor = (update.gamma_max / (INFLATION_AIM * self.target)).powi(2).min(INFLATION_LIMIT);
+            let factor = inflation_factor(update.gamma_max, self.target);
             let inflated =
                 |k: usize| update.covariances[k].matrix.iter().map(|value| value * factor).collect();
             update = self.update(&groups, f64::INFINITY, inflated)?;

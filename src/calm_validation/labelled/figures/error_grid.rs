@@ -9,8 +9,6 @@ use crate::csv::Csv;
 use crate::page::style::{WIDTH, row};
 use crate::page::{FigureContent, FigureEntry};
 
-/// Place of γ_nbr among the scores.
-const AVERAGE: usize = 1;
 /// Most sets in a row: panels have words and insets.
 const COLUMNS: usize = 2;
 /// Height above the first row, points.
@@ -54,7 +52,7 @@ fn panels(sets: &[LabelledSet]) -> Vec<Vec<GridPanel<'_>>> {
     let panel = |line: usize| {
         sets.iter().map(move |set| {
             let (model, score) = match line.checked_sub(1) {
-                None => ("model", set.report.scores.get(AVERAGE)?),
+                None => ("model", set.report.average()?),
                 Some(k) => (set.models[k].model.as_str(), &set.models[k].average),
             };
             Some((format!("{model}: {}", set.file), split(score)?))
