@@ -83,16 +83,11 @@ fn versions(interpreter: &Path) -> Result<PythonVersions, String> {
 
 /// The distributions that are there or not.
 fn packages(found: &PythonVersions, interpreter: &Path) -> Vec<MachineCheck> {
-    let check = |(name, needed_for): &(&'static str, &'static str)| match found
-        .packages
-        .get(*name)
-        .cloned()
-        .flatten()
-    {
-        Some(version) => MachineCheck::present(*name, version, needed_for),
-        None => {
+    let check = |&(name, needed_for): &(&'static str, &'static str)| match found.packages.get(name) {
+        Some(Some(version)) => MachineCheck::present(name, version, needed_for),
+        _ => {
             let advice = format!("{} -m pip install {name}", interpreter.display());
-            MachineCheck::absent(*name, "not installed", needed_for, advice)
+            MachineCheck::absent(name, "not installed", needed_for, advice)
         }
     };
     PACKAGES.iter().map(check).collect()
