@@ -9,6 +9,7 @@ use calm::rules::{CovarianceUpdateKind, Fraction, Positive};
 use dft::PassedEnvironment;
 use md::ThermostatSettings;
 use monitor::reference_check::DifferenceBounds;
+use orchestrator::batch::CustomScheduler;
 use orchestrator::selector::{CampaignMode, OnForgetting, UpdateProtocol};
 use potentials::ZblWindows;
 use potentials::grace::Precision;
@@ -270,6 +271,9 @@ pub struct LabelSection {
     /// Number of cores of one calculation.
     #[serde(default = "defaults::cores")]
     pub cores: NonZeroU32,
+    /// Number of GPUs of one calculation.
+    #[serde(default)]
+    pub gpus: u32,
     /// Time after which a calculation is ended.
     #[serde(default = "defaults::time_limit")]
     pub time_limit: Duration,
@@ -285,10 +289,13 @@ pub struct LabelSection {
     pub pass_environment: PassedEnvironment,
     /// Batch system that runs each calculation as a job. Default: none; calculations run beside the labeller.
     pub batch_system: Option<BatchSystem>,
-    /// Further options for the batch system.
+    /// Further options for Slurm.
     #[serde(default)]
     #[schemars(inner(regex(pattern = "^-")))]
     pub batch_options: Vec<String>,
+    /// The batch system of `launch.custom`, for `batch_system = "custom"`.
+    #[serde(skip)]
+    pub scheduler: Option<CustomScheduler>,
     /// Order in which queued structures of equal priority are labelled: as they were found, or by value.
     #[serde(default)]
     pub order: LabelOrder,
@@ -354,6 +361,14 @@ pub enum LowerStatePolicy {
     Propose,
     /// It becomes the label.
     Supersede,
+}
+
+/// `[launch]`
+#[derive(Clone, Debug, Default, Deserialize, Serialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct LaunchSection {
+    /// The batch system of `calmwalk launch --on custom` and of `label.batch_system = "custom"`.
+    pub custom: Option<CustomScheduler>,
 }
 
 /// `[budget]`
@@ -432,6 +447,7 @@ impl LabelSection {
     pub fn execution_settings(&self) -> ExecutionSettings {
         ExecutionSettings {
             cores: self.cores.get(),
+            gpus: self.gpus,
             time_limit: self.time_limit.seconds(),
             memory: self.memory.map(Positive::get),
             scratch: self.scratch.clone(),
@@ -439,6 +455,7 @@ impl LabelSection {
             pass_environment: self.pass_environment.clone(),
             batch_system: self.batch_system,
             batch_options: self.batch_options.clone(),
+            scheduler: self.scheduler.clone().filter(|_| self.batch_system == Some(BatchSystem::Custom)),
         }
     }
 }
