@@ -445,6 +445,7 @@ impl LabelSection {
 
     /// How programs that calculate labels are run.
     pub fn execution_settings(&self) -> ExecutionSettings {
+        let is_custom = self.batch_system == Some(BatchSystem::Custom);
         ExecutionSettings {
             cores: self.cores.get(),
             gpus: self.gpus,
@@ -455,7 +456,7 @@ impl LabelSection {
             pass_environment: self.pass_environment.clone(),
             batch_system: self.batch_system,
             batch_options: self.batch_options.clone(),
-            scheduler: self.scheduler.clone().filter(|_| self.batch_system == Some(BatchSystem::Custom)),
+            scheduler: self.scheduler.clone().filter(|_| is_custom).map(Box::new),
         }
     }
 }

@@ -14,7 +14,7 @@ pub(super) struct BatchAccess {
 impl BatchAccess {
     pub fn new(execution: &ExecutionSettings) -> Self {
         let custom = execution.scheduler.clone();
-        let custom = custom.map(|scheduler| CustomJobs::new(scheduler, &execution.pass_environment));
+        let custom = custom.map(|scheduler| CustomJobs::new(*scheduler, &execution.pass_environment));
         Self { slurm: Slurm::new(&execution.pass_environment), custom }
     }
 }

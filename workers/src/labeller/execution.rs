@@ -36,7 +36,7 @@ pub struct ExecutionSettings {
     pub batch_options: Vec<String>,
     /// The batch system of [`BatchSystem::Custom`].
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub scheduler: Option<CustomScheduler>,
+    pub scheduler: Option<Box<CustomScheduler>>,
 }
 
 /// A batch system that runs calculations as jobs.
