@@ -1,5 +1,6 @@
 //! Turns Ctrl-C and SIGTERM into the cancellation of a token.
 
+use std::io::{IsTerminal, stdin};
 use std::process;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -10,25 +11,26 @@ use tokio_util::sync::CancellationToken;
 use crate::exit_status::CommandError;
 use crate::output::log_and_print;
 
-/// A batch system signals every process of a job, and the job script forwards the signal it receives. Signals within
-/// this time count as one request.
+/// A batch system signals every process of a job, with SIGTERM or SIGINT, and the job script forwards the signal it receives. Signals
+/// within this time count as one request.
 const SIGNAL_MERGE_WINDOW: Duration = Duration::from_secs(5);
 
 /// Cancels `stop` and prints `message` on the first Ctrl-C, SIGTERM or hang-up. A second signal exits at once, which is
-/// safe too, unless it is a SIGTERM within [`SIGNAL_MERGE_WINDOW`] of the first.
+/// safe too, unless it comes within [`SIGNAL_MERGE_WINDOW`] of the first and is no Ctrl-C at a terminal.
 pub fn cancel_on_signal(stop: CancellationToken, message: &'static str) -> Result<(), CommandError> {
     let mut interrupt = signal(SignalKind::interrupt()).map_err(CommandError::failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(CommandError::failed)?;
     let mut hangup = signal(SignalKind::hangup()).map_err(CommandError::failed)?;
+    let at_terminal = stdin().is_terminal();
     tokio::spawn(async move {
         let mut asked: Option<Instant> = None;
         loop {
-            let again = tokio::select! {
-                _ = interrupt.recv() => false,
-                _ = hangup.recv() => false,
-                _ = terminate.recv() => asked.is_some_and(|asked| asked.elapsed() < SIGNAL_MERGE_WINDOW),
+            let may_be_same = tokio::select! {
+                _ = interrupt.recv() => !at_terminal,
+                _ = hangup.recv() => !at_terminal,
+                _ = terminate.recv() => true,
             };
-            if again {
+            if may_be_same && asked.is_some_and(|asked| asked.elapsed() < SIGNAL_MERGE_WINDOW) {
                 continue;
             }
             if asked.replace(Instant::now()).is_some() {

@@ -239,13 +239,15 @@ fn foundation_campaign(name: &str, walks: usize) -> String {
 
 #[test]
 fn every_file_of_configs_is_run_by_a_test() {
-    // `cargo test --test external dft::` runs silicon-dft.toml.
+    // `cargo test --test external dft::` runs silicon-dft.toml, and `batch_systems` campaigns with lsf.toml and pbs.toml.
     let run = [
         "aluminium.toml",
         "foundation-campaign.toml",
         "foundation-expansion.toml",
+        "lsf.toml",
         "md-aluminium.toml",
         "nickel-aluminium-hydrogen.toml",
+        "pbs.toml",
         "silicon-dft.toml",
         "silicon.toml",
     ];

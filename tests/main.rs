@@ -7,6 +7,7 @@ mod common;
 
 mod backup;
 mod baselines;
+mod batch_systems;
 mod budgets;
 mod calculations;
 mod calm_export;

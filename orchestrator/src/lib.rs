@@ -5,11 +5,11 @@
 //! then answers.
 //!
 //! Process supervision has the same structure: the [`supervisor`] decides, the [`launcher`] starts and monitors
-//! processes. If a batch system starts the processes, [`slurm`] decides which jobs to submit.
+//! processes. If a batch system starts the processes, [`batch`] decides which jobs to submit.
 
+pub mod batch;
 pub mod grader;
 pub mod launcher;
 pub mod reactor;
 pub mod selector;
-pub mod slurm;
 pub mod supervisor;

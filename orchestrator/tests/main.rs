@@ -2,6 +2,7 @@
 
 mod common;
 
+mod batch_plan;
 mod commit_batch;
 mod completion;
 mod decisions;
@@ -9,7 +10,6 @@ mod nothing_new;
 mod reactor;
 mod replay;
 mod reproducible;
-mod slurm_plan;
 mod supervisor;
 mod versions;
 mod walks;

@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may change when a campaign is resumed; all others keep their first values.
-pub(super) const CHANGEABLE: [&str; 65] = [
+pub(super) const CHANGEABLE: [&str; 83] = [
     "campaign.control_share",
     "seed_structures",
     "collect.max_per_walk",
@@ -25,6 +25,7 @@ pub(super) const CHANGEABLE: [&str; 65] = [
     "label.min_state_difference",
     "label.on_lower_state",
     "label.cores",
+    "label.gpus",
     "label.time_limit",
     "label.memory",
     "label.scratch",
@@ -71,6 +72,23 @@ pub(super) const CHANGEABLE: [&str; 65] = [
     "refit.threads",
     "refit.test_sets",
     "refit.method.command.time_limit",
+    "launch.custom.name",
+    "launch.custom.submit",
+    "launch.custom.id_after",
+    "launch.custom.start_after",
+    "launch.custom.queue_full",
+    "launch.custom.poll",
+    "launch.custom.state_after",
+    "launch.custom.states.pending",
+    "launch.custom.states.running",
+    "launch.custom.states.completed",
+    "launch.custom.states.failed",
+    "launch.custom.states.cancelled",
+    "launch.custom.vanished",
+    "launch.custom.cancel",
+    "launch.custom.script",
+    "launch.custom.log.time_limit",
+    "launch.custom.log.out_of_memory",
 ];
 
 const BONDS: &str = "label.guard.min_bond_lengths";
@@ -259,6 +277,8 @@ fn seed_structures(before: &Value, after: &Value) -> Result<ConfigChange, Refuse
 /// The configuration with all changeable keys set to null.
 pub fn without_changeable(configuration: &Value) -> Value {
     let mut fixed = configuration.clone();
+    // All of its keys are changeable, and it may be left out.
+    fixed.as_object_mut().map(|sections| sections.remove("launch"));
     for key in CHANGEABLE {
         let pointer = format!("/{}", key.replace('.', "/"));
         if let Some(value) = fixed.pointer_mut(&pointer) {
@@ -397,6 +417,18 @@ mod tests {
         let expected = "refit.replay[0] is \"ab\", but this campaign started without it: a campaign keeps";
         assert!(message.starts_with(expected), "{message}");
         assert!(compare(&before, &without).is_err());
+    }
+
+    #[test]
+    fn a_batch_system_may_come_change_and_go() {
+        let with =
+            |poll: &str| json!({ "launch": { "custom": { "poll": poll, "states": { "running": ["R"] } } } });
+        for (before, after, number) in
+            [(json!({}), with("a"), 2), (with("a"), with("b"), 1), (with("a"), json!({}), 2)]
+        {
+            assert_eq!(compare(&before, &after).unwrap().len(), number);
+            assert_eq!(without_changeable(&before), without_changeable(&after));
+        }
     }
 
     #[test]

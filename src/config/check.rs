@@ -9,11 +9,12 @@ use md::{ThermostatSettings, WrongSetting};
 use orchestrator::selector::{CampaignMode, UpdateProtocol};
 use potentials::{RadiiWindows, ZblWindow, ZblWindows};
 use store::ServerUrl;
+use workers::labeller::BatchSystem;
 
 use self::refit::check_refit;
 use super::error::InvalidValue;
 use super::ranges;
-use super::{Config, LabelSection, NotifySection, QueueFull};
+use super::{Config, LabelSection, LaunchSection, NotifySection, QueueFull};
 
 /// Upper limit of the smallest allowed distance of a pair of elements, Å.
 const MAX_MIN_DISTANCE: f64 = 10.0;
@@ -39,7 +40,8 @@ pub fn check(config: &Config) -> Vec<InvalidValue> {
         check_notify(&config.notify),
         check_seed_structures(config),
     ];
-    let of_sections = check_label(&config.label).into_iter().chain(check_refit(config));
+    let of_sections =
+        check_label(&config.label, config.launch.as_ref()).into_iter().chain(check_refit(config));
     checks.into_iter().filter_map(Result::err).chain(of_sections).collect()
 }
 
@@ -120,12 +122,33 @@ fn check_completion(config: &Config) -> Result<(), InvalidValue> {
     Ok(())
 }
 
-/// Checks the keys of `[label]` alone and returns all invalid values.
-pub fn check_label(label: &LabelSection) -> Vec<InvalidValue> {
+/// Checks the keys of `[label]` and `[launch]` alone and returns all invalid values.
+pub fn check_label(label: &LabelSection, launch: Option<&LaunchSection>) -> Vec<InvalidValue> {
     let guard =
         label.guard.fault().map(|(key, found, expected)| (key.to_owned(), found, expected.to_owned()));
-    let checks = [check_pass_environment(label), check_batch_options(label), check_scratch(label)];
+    let checks = [
+        check_pass_environment(label),
+        check_batch_options(label),
+        check_scratch(label),
+        check_batch_system(label, launch),
+    ];
     guard.into_iter().chain(checks.into_iter().filter_map(Result::err)).collect()
+}
+
+/// Checks the batch system that the configuration describes, and that there is one where labels need it.
+fn check_batch_system(label: &LabelSection, launch: Option<&LaunchSection>) -> Result<(), InvalidValue> {
+    match launch.and_then(|launch| launch.custom.as_ref()) {
+        Some(custom) => match custom.fault() {
+            Some((key, found, expected)) => wrong(&format!("launch.custom.{key}"), found, expected),
+            None => Ok(()),
+        },
+        None if label.batch_system == Some(BatchSystem::Custom) => {
+            let expected =
+                "the table [launch.custom] beside it: configs/pbs.toml and configs/lsf.toml have one";
+            wrong("label.batch_system", "\"custom\"", expected)
+        }
+        None => Ok(()),
+    }
 }
 
 fn check_pass_environment(label: &LabelSection) -> Result<(), InvalidValue> {
@@ -135,6 +158,13 @@ fn check_pass_environment(label: &LabelSection) -> Result<(), InvalidValue> {
 }
 
 fn check_batch_options(label: &LabelSection) -> Result<(), InvalidValue> {
+    if let Some(option) = label.batch_options.first()
+        && label.batch_system == Some(BatchSystem::Custom)
+    {
+        let expected =
+            "no options with batch_system = \"custom\": write what they say into launch.custom.script";
+        return wrong("label.batch_options", format!("{option:?}"), expected);
+    }
     if let Some(option) = label.batch_options.iter().find(|option| !is_option(option)) {
         let expected = "options of sbatch, each with its value in one string, such as \"--partition=long\"";
         return wrong("label.batch_options", format!("{option:?}"), expected);

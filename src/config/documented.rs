@@ -195,6 +195,23 @@ fn the_schema_has_every_key_of_the_reference() {
     assert!(keys > RANGES.len());
 }
 
+/// The examples of batch systems make valid campaigns, and the page repeats them.
+#[test]
+fn the_batch_systems_of_the_page_are_those_of_the_files() {
+    let page = read("docs/batch-systems.md");
+    for name in ["pbs", "lsf"] {
+        let text = read(&format!("configs/{name}.toml"));
+        let table = &text[text.find("[launch.custom]").unwrap()..];
+        assert!(page.contains(&format!("```toml\n{table}```\n")), "{name}");
+        let with = |label: &str| campaign("aluminium.toml").replacen("[label]\n", label, 1) + "\n" + table;
+        let resolved = resolved(&with("[label]\n"));
+        assert!(resolved["launch"]["custom"]["script"].is_string());
+        for key in super::changes::CHANGEABLE.iter().filter_map(|key| key.strip_prefix("launch.")) {
+            assert!(resolved["launch"].pointer(&format!("/{}", key.replace('.', "/"))).is_some(), "{key}");
+        }
+    }
+}
+
 #[test]
 fn the_reference_has_every_range() {
     let text = read("docs/configuration.md");

@@ -27,6 +27,7 @@ use std::path::{Path, PathBuf};
 
 use calm::UpdateSettings;
 use calm::rules::Positive;
+use orchestrator::batch::CustomScheduler;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use store::{Location, StoreError};
@@ -91,6 +92,9 @@ pub struct Config {
     /// Notifications about events of the campaign.
     #[serde(default)]
     pub notify: NotifySection,
+    /// A batch system other than Slurm.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub launch: Option<LaunchSection>,
 }
 
 /// Placeholders for required keys that are missing or invalid, so that the rest can be checked.
@@ -142,6 +146,7 @@ impl Config {
         // What could not be read was noted, and is an error.
         let mut config = config.ok_or_else(|| ConfigError::unreadable(path))?;
         config.resolve_paths(path.parent().unwrap_or(Path::new("")));
+        config.label.scheduler = config.launch.as_ref().and_then(|launch| launch.custom.clone());
         Ok(Loaded { config, text, warnings })
     }
 
@@ -150,18 +155,23 @@ impl Config {
         #[derive(Deserialize)]
         struct LabelDocument {
             label: LabelSection,
+            #[serde(default)]
+            launch: Option<LaunchSection>,
         }
         let text = read_text(path)?;
         let mut document = Document::parse(path, &text)?;
         let labels: Option<LabelDocument> = document.read(PLACEHOLDERS, &Self::known_keys());
         document.check_ranges("walk");
-        document
-            .check_rules(|| labels.as_ref().map(|all| check::check_label(&all.label)).unwrap_or_default());
+        document.check_rules(|| {
+            let of = |all: &LabelDocument| check::check_label(&all.label, all.launch.as_ref());
+            labels.as_ref().map(of).unwrap_or_default()
+        });
         document.refuse_unfilled();
         document.finish()?;
-        let LabelDocument { mut label } = labels.ok_or_else(|| ConfigError::unreadable(path))?;
+        let LabelDocument { mut label, launch } = labels.ok_or_else(|| ConfigError::unreadable(path))?;
         let directory = path.parent().unwrap_or(Path::new(""));
         label.method.paths().into_iter().for_each(|path| *path = directory.join(&*path));
+        label.scheduler = launch.and_then(|launch| launch.custom);
         Ok(label)
     }
 
@@ -204,6 +214,8 @@ impl Config {
             .with::<StopSection>("stop")
             .with::<RunSection>("run")
             .with::<NotifySection>("notify")
+            .with::<LaunchSection>("launch")
+            .with::<CustomScheduler>("launch.custom")
             .with::<RefitSection>("refit")
             .with::<NativeRefit>("refit.method.native")
             .with::<CommandRefit>("refit.method.command")

@@ -67,7 +67,7 @@ const fn range(
 }
 
 /// All ranges, by table.
-pub static RANGES: [Range; 114] = [
+pub static RANGES: [Range; 115] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -120,6 +120,7 @@ pub static RANGES: [Range; 114] = [
     ),
     range("label.min_state_difference", "eV/atom", [0.0, 1e3], [1e-5, 0.1], PER_ATOM),
     range("label.cores", "", [0.0, 4096.0], [1.0, 2048.0], ""),
+    range("label.gpus", "", [0.0, 1024.0], [0.0, 64.0], ""),
     range("label.time_limit", TIME, [1.0, 30.0 * DAY], [10.0, 7.0 * DAY], ""),
     range("label.memory", "GB", [0.0, 1e6], [0.1, 1e4], "it is in GB"),
     range("label.queue_limit", "", [0.0, 1e9], [1.0, 1e6], ""),

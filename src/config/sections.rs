@@ -9,6 +9,7 @@ use calm::rules::{CovarianceUpdateKind, Fraction, Positive};
 use dft::PassedEnvironment;
 use md::ThermostatSettings;
 use monitor::reference_check::DifferenceBounds;
+use orchestrator::batch::CustomScheduler;
 use orchestrator::selector::{CampaignMode, OnForgetting, UpdateProtocol};
 use potentials::ZblWindows;
 use potentials::grace::Precision;
@@ -273,6 +274,9 @@ pub struct LabelSection {
     /// Number of cores of one calculation.
     #[serde(default = "defaults::cores")]
     pub cores: NonZeroU32,
+    /// Number of GPUs of one calculation.
+    #[serde(default)]
+    pub gpus: u32,
     /// Time after which a calculation is ended.
     #[serde(default = "defaults::time_limit")]
     pub time_limit: Duration,
@@ -288,10 +292,13 @@ pub struct LabelSection {
     pub pass_environment: PassedEnvironment,
     /// Batch system that runs each calculation as a job. Default: none; calculations run beside the labeller.
     pub batch_system: Option<BatchSystem>,
-    /// Further options for the batch system.
+    /// Further options for Slurm.
     #[serde(default)]
     #[schemars(inner(regex(pattern = "^-")))]
     pub batch_options: Vec<String>,
+    /// The batch system of `launch.custom`, for `batch_system = "custom"`.
+    #[serde(skip)]
+    pub scheduler: Option<CustomScheduler>,
     /// Order in which queued structures of equal priority are labelled: as they were found, or by value.
     #[serde(default)]
     pub order: LabelOrder,
@@ -357,6 +364,14 @@ pub enum LowerStatePolicy {
     Propose,
     /// It becomes the label.
     Supersede,
+}
+
+/// `[launch]`
+#[derive(Clone, Debug, Default, Deserialize, Serialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct LaunchSection {
+    /// The batch system of `calmwalk launch --on custom` and of `label.batch_system = "custom"`.
+    pub custom: Option<CustomScheduler>,
 }
 
 /// `[budget]`
@@ -433,8 +448,10 @@ impl LabelSection {
 
     /// How programs that calculate labels are run.
     pub fn execution_settings(&self) -> ExecutionSettings {
+        let is_custom = self.batch_system == Some(BatchSystem::Custom);
         ExecutionSettings {
             cores: self.cores.get(),
+            gpus: self.gpus,
             time_limit: self.time_limit.seconds(),
             memory: self.memory.map(Positive::get),
             scratch: self.scratch.clone(),
@@ -442,6 +459,7 @@ impl LabelSection {
             pass_environment: self.pass_environment.clone(),
             batch_system: self.batch_system,
             batch_options: self.batch_options.clone(),
+            scheduler: self.scheduler.clone().filter(|_| is_custom).map(Box::new),
         }
     }
 }

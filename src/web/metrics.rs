@@ -10,6 +10,7 @@ use axum::routing::get;
 use monitor::Snapshot;
 use monitor::versions::{CampaignVersions, VersionStanding, VersionSummary};
 use store::{CampaignStatus, Store, unix_milliseconds};
+use wire::DeviceStatistics;
 
 use super::exposition::{CONTENT_TYPE, MetricsText};
 

@@ -14,6 +14,7 @@ pub mod npz;
 pub mod processes;
 pub mod report;
 pub mod slurm;
+pub mod stand_in;
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output};

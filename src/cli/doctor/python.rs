@@ -63,7 +63,7 @@ pub fn checks(environment: Option<&Path>) -> Vec<MachineCheck> {
         }
         Err(error) => {
             let found = format!("{}: {error}", interpreter.display());
-            let advice = "name a virtual environment, a conda prefix or an interpreter (--python, potential.environment)";
+            let advice = "name a virtual environment, a conda prefix or an interpreter (--python, potential.python.environment)";
             vec![MachineCheck::absent(NAME, found, NEEDED_FOR, advice).required_if(required)]
         }
     }

@@ -15,8 +15,6 @@ use crate::{disk_forecast, runtime};
 /// A configuration, and what its files and its label method say.
 pub struct Requirements {
     /// The configuration.
-    pub config: Config,
-    python: Option<PathBuf>,
     labels: Result<(), String>,
     /// `None` if the label method is not there, without which a campaign cannot be loaded.
     campaign: Option<Result<LoadedCampaign, String>>,
@@ -33,8 +31,7 @@ impl Requirements {
         let labels = method.and_then(|method| method.identity()).map(drop).map_err(|error| error.to_string());
         let load = || LoadedCampaign::load(path).map_err(|error| error.to_string());
         let campaign = labels.is_ok().then(load);
-        let python = python_environment(&loaded.text, path.parent().unwrap_or(Path::new("")));
-        Ok(Self { config: loaded.config, python, labels, campaign })
+        Ok(Self { config: loaded.config, labels, campaign })
     }
 
     /// Number of walkers on this machine.
@@ -56,7 +53,7 @@ impl Requirements {
 
     /// The Python environment of its potential.
     pub fn python(&self) -> Option<PathBuf> {
-        self.python.clone()
+        self.config.potential.python.as_ref().map(|python| python.environment.clone())
     }
 
     /// Whether its labels are jobs of Slurm.
@@ -101,26 +98,5 @@ impl Requirements {
 
     fn loaded(&self) -> Option<&LoadedCampaign> {
         self.campaign.as_ref()?.as_ref().ok()
-    }
-}
-
-/// `potential.environment` of a configuration in `directory`, if its potential is a Python one.
-fn python_environment(text: &str, directory: &Path) -> Option<PathBuf> {
-    let table: Table = text.parse().ok()?;
-    let environment = table.get("potential")?.get("environment").and_then(Value::as_str)?;
-    Some(directory.join(environment))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_environment_of_a_python_potential_is_relative_to_its_configuration() {
-        let at = |text: &str| python_environment(text, Path::new("here"));
-        assert_eq!(at("[potential]\nkind = \"python\"\nenvironment = \"env\""), Some("here/env".into()));
-        assert_eq!(at("[potential]\nenvironment = \"/opt/env\""), Some("/opt/env".into()));
-        assert_eq!(at("[potential]\nmodel = \"m.npz\""), None);
-        assert_eq!(at("not toml ="), None);
     }
 }

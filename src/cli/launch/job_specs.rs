@@ -1,32 +1,44 @@
-//! Scripts and `sbatch` options of each kind of job.
+//! Scripts and options of each kind of job.
 
 use std::fs::{self, File};
-use std::io::{self, ErrorKind, Write};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use orchestrator::slurm::{DesiredJobs, JobNames, JobOptions, JobPhase, Plan, Role, SlurmJob};
-use wire::net::Tls;
+use orchestrator::batch::{
+    BatchScheduler, CampaignJob, DesiredJobs, JobId, JobNames, JobOptions, JobPhase, Plan, Role, quoted,
+};
 
-use super::templates::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, TemplateValues, fill, quoted, template};
-use super::{FOLDER, LaunchArgs, absolute};
+use super::commands::{ENDPOINT, JobCommands, text};
+use super::custom_scripts::{self, CustomScripts};
+use super::templates::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, TemplateValues, fill, template};
+use super::{LaunchArgs, System};
 use crate::atomic_file::cannot_write;
 use crate::campaign::LoadedCampaign;
 use crate::exit_status::CommandError;
-use crate::runtime::reference_check;
+use crate::output::log_and_warn;
 
-/// The file in the campaign's directory to which the orchestrator announces its endpoint.
-const ENDPOINT: &str = "endpoint";
-/// How long an agent or labeller waits for the campaign, and an orchestrator for its predecessor. The job then tries again.
-const WAIT_TIMEOUT: &str = "--wait-timeout=15m";
+/// Bytes per unit M of `--mem`.
+const MEBIBYTE: u64 = 1 << 20;
 
 /// Everything needed to submit the jobs of a campaign.
 pub struct JobSpecs {
+    on: System,
     directory: PathBuf,
     folder: PathBuf,
     /// Names and texts of the scripts.
-    scripts: Vec<(&'static str, String)>,
+    scripts: Vec<(String, String)>,
     options: Vec<String>,
+    /// Options of jobs with walkers.
+    walk_options: Vec<String>,
     walkers: u32,
+}
+
+/// Cores of each kind of job.
+#[derive(Clone, Copy)]
+pub(super) struct CoresOfJobs {
+    pub orchestrator: usize,
+    pub agent: usize,
+    pub labeller: usize,
 }
 
 impl JobSpecs {
@@ -35,54 +47,54 @@ impl JobSpecs {
         campaign: &LoadedCampaign,
         directory: &Path,
         wanted: DesiredJobs,
+        names: &JobNames,
+        scheduler: &BatchScheduler,
     ) -> Result<Self, CommandError> {
-        let folder = directory.join(FOLDER);
-        let commands = Commands::new(launch, campaign, directory)?;
-        let job = quoted(&text(&folder.join(COMMON))?);
+        let folder = directory.join(launch.on.folder());
+        let commands = JobCommands::new(launch, campaign, directory)?;
         let config = &campaign.config;
-        // run.walkers = 0 is one walker per core, that is, as many as the job has cores.
-        let cores = match config.run.walkers {
-            0 => config.run.threads_per_walker.get().max(2),
-            walkers => walkers * config.run.threads_per_walker.get() + config.label.concurrency,
+        let cores = CoresOfJobs {
+            // run.walkers = 0 is one walker per core, that is, as many as the job has cores.
+            orchestrator: match config.run.walkers {
+                0 => config.run.threads_per_walker.get().max(2),
+                walkers => walkers * config.run.threads_per_walker.get() + config.label.concurrency,
+            },
+            agent: (launch.walkers * launch.threads) as usize,
+            labeller: launch.concurrency as usize,
         };
-        let values = |cpus: usize, command: String| {
-            [
-                ("cpus", cpus.to_string()),
-                ("command", command),
-                ("stop", commands.stop()),
-                ("job", job.clone()),
-            ]
+        let scripts = match scheduler {
+            BatchScheduler::Slurm(_) => slurm_scripts(launch, &folder, &commands, wanted, cores)?,
+            BatchScheduler::Custom(custom) => {
+                let client = custom.client();
+                let scripts = CustomScripts {
+                    launch,
+                    client,
+                    names,
+                    directory,
+                    folder: &folder,
+                    commands: &commands,
+                    cores,
+                };
+                scripts.all(wanted)?
+            }
         };
-        let site = launch.template.as_deref();
-        let script = |name: &'static str, values: &TemplateValues<'_>| {
-            template(site, name).and_then(|template| fill(name, &template, values)).map(|text| (name, text))
-        };
-        let mut scripts = vec![script(ORCHESTRATOR, &values(cores, commands.orchestrator(wanted)?))?];
-        if wanted.agents > 0 {
-            scripts
-                .push(script(AGENT, &values((launch.walkers * launch.threads) as usize, commands.agent()?))?);
-        }
-        if wanted.labellers > 0 {
-            scripts.push(script(LABELLER, &values(launch.concurrency as usize, commands.labeller()))?);
-        }
-        scripts.push((COMMON, template(site, COMMON)?));
+        let options = options(launch);
+        let gpus = (launch.gpus > 0).then(|| format!("--gres=gpu:{}", launch.gpus));
         Ok(Self {
+            on: launch.on,
             directory: directory.into(),
             folder,
             scripts,
-            options: options(launch),
+            // The user's own options come last.
+            walk_options: gpus.into_iter().chain(options.iter().cloned()).collect(),
+            options,
             walkers: launch.walkers,
         })
     }
 
-    /// Excludes concurrent launches, if the file system supports locks. Otherwise Slurm runs only one of two jobs with the same
-    /// name at a time.
-    pub fn lock(&self) -> Result<Option<File>, CommandError> {
-        fs::create_dir_all(&self.folder).map_err(|error| cannot_write(&self.folder, error))?;
-        let path = self.folder.join("launch.lock");
-        let file = File::options().create(true).append(true).open(&path);
-        let file = file.map_err(|error| cannot_write(&path, error))?;
-        Ok(file.lock().is_ok().then_some(file))
+    /// The folder of the scripts.
+    pub fn folder(&self) -> &Path {
+        &self.folder
     }
 
     /// Writes the scripts.
@@ -101,181 +113,138 @@ impl JobSpecs {
     }
 
     /// The existing job of the orchestrator that is not cancelled, if there is one.
-    pub fn orchestrator_job(&self, jobs: &[SlurmJob], cancelled: &[u64]) -> Option<u64> {
-        let is_active = |job: &&SlurmJob| matches!(job.phase(), JobPhase::Pending | JobPhase::Running);
+    pub fn orchestrator_job(&self, jobs: &[CampaignJob], cancelled: &[JobId]) -> Option<JobId> {
+        let is_active = |job: &&CampaignJob| matches!(job.phase(), JobPhase::Pending | JobPhase::Running);
         let mut active = jobs.iter().filter(|job| job.role == Role::Orchestrator).filter(is_active);
-        active.find(|job| !cancelled.contains(&job.id)).map(|job| job.id)
+        active.find(|job| !cancelled.contains(&job.id)).map(|job| job.id.clone())
     }
 
-    /// The `sbatch` request of a job.
-    pub fn request(&self, role: Role, orchestrator: Option<u64>) -> JobOptions<'_> {
-        let (script, name) = match role {
-            Role::Orchestrator => (ORCHESTRATOR, role.name()),
-            Role::Agent(_) => (AGENT, role.name()),
-            Role::Labeller(_) => (LABELLER, role.name()),
+    /// The request of a job.
+    pub fn request(&self, role: Role, orchestrator: Option<JobId>) -> JobOptions<'_> {
+        let of_slurm = match role {
+            Role::Orchestrator => ORCHESTRATOR,
+            Role::Agent(_) => AGENT,
+            Role::Labeller(_) => LABELLER,
+        };
+        let script = match self.on {
+            System::Slurm => of_slurm.to_owned(),
+            System::Custom => custom_scripts::job_file(role),
         };
         JobOptions {
             script: self.folder.join(script),
-            log: self.folder.join(format!("{name}.log")),
+            log: self.folder.join(format!("{}.log", role.name())),
             directory: &self.directory,
             walkers: self.walkers,
             orchestrator,
-            options: &self.options,
+            options: if matches!(role, Role::Labeller(_)) { &self.options } else { &self.walk_options },
         }
     }
 
-    /// Prints what would be written and submitted.
-    pub fn print(
+    /// What would be written and submitted.
+    pub fn shown(
         &self,
-        out: &mut dyn Write,
+        scheduler: &BatchScheduler,
         names: &JobNames,
         plan: &Plan,
-        jobs: &[SlurmJob],
-    ) -> io::Result<()> {
+        jobs: &[CampaignJob],
+    ) -> Result<String, CommandError> {
+        let mut lines = Vec::new();
         for (name, text) in &self.scripts {
-            writeln!(out, "==> {}\n{text}", self.folder.join(name).display())?;
+            lines.push(format!("==> {}\n{text}", self.folder.join(name).display()));
         }
-        if !plan.cancel.is_empty() {
-            let ids: Vec<_> = plan.cancel.iter().map(u64::to_string).collect();
-            writeln!(out, "scancel {}", ids.join(" "))?;
+        match scheduler {
+            BatchScheduler::Slurm(_) if plan.cancel.is_empty() => {}
+            BatchScheduler::Slurm(_) => {
+                let ids: Vec<_> = plan.cancel.iter().map(JobId::as_str).collect();
+                lines.push(format!("scancel {}", ids.join(" ")));
+            }
+            BatchScheduler::Custom(custom) => {
+                for id in &plan.cancel {
+                    lines.push(custom.client().cancel_command(id).map_err(CommandError::failed)?);
+                }
+            }
         }
         let orchestrator = self.orchestrator_job(jobs, &plan.cancel);
         for submission in &plan.submit {
-            let arguments = self.request(submission.role, orchestrator).arguments(names, submission);
-            let words: Vec<_> = arguments.iter().map(|word| quoted(&word.to_string_lossy())).collect();
-            writeln!(out, "sbatch {}", words.join(" "))?;
+            let request = self.request(submission.role, orchestrator.clone());
+            lines.push(match scheduler {
+                BatchScheduler::Slurm(_) => {
+                    let arguments = request.arguments(names, submission);
+                    let words: Vec<_> =
+                        arguments.iter().map(|word| quoted(&word.to_string_lossy())).collect();
+                    format!("sbatch {}", words.join(" "))
+                }
+                BatchScheduler::Custom(custom) => {
+                    let after =
+                        request.orchestrator.as_ref().filter(|_| submission.role != Role::Orchestrator);
+                    custom.client().submit_command(&request.script, after).map_err(CommandError::failed)?
+                }
+            });
         }
         if plan.cancel.is_empty() && plan.submit.is_empty() {
-            writeln!(out, "all jobs exist already")?;
+            lines.push("all jobs exist already".to_owned());
         }
-        Ok(())
+        Ok(lines.join("\n") + "\n")
     }
+}
+
+/// Excludes concurrent launches, if the file system supports locks. Otherwise Slurm runs only one of two jobs with the same
+/// name at a time.
+pub fn lock(folder: &Path) -> Result<Option<File>, CommandError> {
+    fs::create_dir_all(folder).map_err(|error| cannot_write(folder, error))?;
+    let path = folder.join("launch.lock");
+    let file = File::options().create(true).append(true).open(&path);
+    let file = file.map_err(|error| cannot_write(&path, error))?;
+    if let Err(error) = file.lock() {
+        if folder.ends_with(super::CUSTOM_FOLDER) {
+            log_and_warn(format_args!(
+                "WARNING: cannot lock {} ({error}): do not launch the campaign twice at the same time",
+                path.display()
+            ));
+        }
+        return Ok(None);
+    }
+    Ok(Some(file))
+}
+
+/// The scripts of Slurm jobs: one for each kind, and what they share.
+fn slurm_scripts(
+    launch: &LaunchArgs,
+    folder: &Path,
+    commands: &JobCommands<'_>,
+    wanted: DesiredJobs,
+    cores: CoresOfJobs,
+) -> Result<Vec<(String, String)>, CommandError> {
+    let job = quoted(&text(&folder.join(COMMON))?);
+    let values = |cpus: usize, command: String| {
+        [("cpus", cpus.to_string()), ("command", command), ("stop", commands.stop()), ("job", job.clone())]
+    };
+    let site = launch.template.as_deref();
+    let script = |name: &str, values: &TemplateValues<'_>| {
+        let text = template(site, name).and_then(|template| fill(name, &template, values));
+        text.map(|text| (name.to_owned(), text))
+    };
+    let mut scripts =
+        vec![script(ORCHESTRATOR, &values(cores.orchestrator, commands.orchestrator(wanted)?))?];
+    if wanted.agents > 0 {
+        scripts.push(script(AGENT, &values(cores.agent, commands.agent()?))?);
+    }
+    if wanted.labellers > 0 {
+        scripts.push(script(LABELLER, &values(cores.labeller, commands.labeller()))?);
+    }
+    scripts.push((COMMON.to_owned(), template(site, COMMON)?));
+    Ok(scripts)
 }
 
 /// Options of `sbatch` for every job.
 fn options(launch: &LaunchArgs) -> Vec<String> {
-    let named = [("time", &launch.time), ("partition", &launch.partition), ("account", &launch.account)];
+    let memory = launch.memory.map(|bytes| format!("{}M", bytes.div_ceil(MEBIBYTE)));
+    let named = [
+        ("time", &launch.time),
+        ("partition", &launch.partition),
+        ("account", &launch.account),
+        ("mem", &memory),
+    ];
     let named = named.iter().filter_map(|(name, value)| Some(format!("--{name}={}", value.as_ref()?)));
     named.chain(launch.options.iter().cloned()).collect()
-}
-
-/// The commands that the jobs run, quoted for a shell.
-struct Commands<'a> {
-    launch: &'a LaunchArgs,
-    program: String,
-    config: String,
-    directory: String,
-    endpoint: String,
-    store: Option<&'a str>,
-    /// With `--accept-reference-check`: identity of the check that is accepted.
-    accepted_check: Option<String>,
-}
-
-impl<'a> Commands<'a> {
-    fn new(
-        launch: &'a LaunchArgs,
-        campaign: &'a LoadedCampaign,
-        directory: &Path,
-    ) -> Result<Self, CommandError> {
-        Ok(Self {
-            launch,
-            program: text(&std::env::current_exe().map_err(CommandError::failed)?)?,
-            config: text(&absolute(&launch.config)?)?,
-            directory: text(directory)?,
-            endpoint: text(&directory.join(ENDPOINT))?,
-            store: campaign.config.run.store.as_deref(),
-            // The job may be requeued after the configuration has changed, with differences that the user has not seen.
-            accepted_check: launch
-                .accept_reference_check
-                .then(|| reference_check::identity(campaign))
-                .transpose()?,
-        })
-    }
-
-    fn command<'w>(&'w self, words: impl IntoIterator<Item = &'w str>) -> String {
-        let words = [self.program.as_str()].into_iter().chain(words);
-        words.map(quoted).collect::<Vec<_>>().join(" ")
-    }
-
-    fn orchestrator(&self, wanted: DesiredJobs) -> Result<String, CommandError> {
-        let mut words = vec!["run", &self.config, "--directory", &self.directory, WAIT_TIMEOUT];
-        if self.launch.adopt {
-            words.push("--adopt");
-        }
-        let accepted =
-            self.accepted_check.as_ref().map(|identity| format!("--accept-reference-check={identity}"));
-        words.extend(accepted.as_deref());
-        let tls = self.certificates("orchestrator")?;
-        if wanted.agents > 0 {
-            let endpoint = if tls.is_some() { "tcp/0.0.0.0:0" } else { "tcp/127.0.0.1:0" };
-            words.extend(["--listen", endpoint, "--announce", &self.endpoint]);
-            words.extend(tls.iter().flat_map(|directory| ["--tls", directory]));
-        }
-        Ok(self.command(words))
-    }
-
-    fn agent(&self) -> Result<String, CommandError> {
-        let join = format!("@{}", self.endpoint);
-        let (walkers, threads) = (self.launch.walkers.to_string(), self.launch.threads.to_string());
-        let tls = self.certificates("agent")?;
-        self.check_reachable(tls.is_some())?;
-        let words = ["agent", "--join", &join, "--walkers", &walkers, "--threads", &threads, WAIT_TIMEOUT];
-        Ok(self.command(words.into_iter().chain(tls.iter().flat_map(|directory| ["--tls", directory]))))
-    }
-
-    fn labeller(&self) -> String {
-        let (store, concurrency) =
-            (self.store.unwrap_or(&self.directory), self.launch.concurrency.to_string());
-        self.command([
-            "label",
-            "--store",
-            store,
-            "--concurrency",
-            &concurrency,
-            WAIT_TIMEOUT,
-            "--grace-period=60s",
-        ])
-    }
-
-    fn stop(&self) -> String {
-        let words = ["launch", &self.config, "--on", "slurm", "--directory", &self.directory, "--stop"];
-        self.command(words)
-    }
-
-    /// The directory with the certificate of `role`, "orchestrator" or "agent", after a check of its files.
-    fn certificates(&self, role: &str) -> Result<Option<String>, CommandError> {
-        let Some(tls) = &self.launch.tls else { return Ok(None) };
-        let directory = absolute(&tls.join(role))?;
-        let certificates = Tls::from_directory(&directory);
-        let checked = match role {
-            "orchestrator" => certificates.check_for_orchestrator(),
-            _ => certificates.check_for_agent(),
-        };
-        checked.map_err(CommandError::input)?;
-        text(&directory).map(Some)
-    }
-
-    /// Without certificates, all jobs must run on the orchestrator's node.
-    fn check_reachable(&self, tls: bool) -> Result<(), CommandError> {
-        let is_node = |option: &String| option.starts_with("--nodelist") || option.starts_with("-w");
-        if tls || self.launch.options.iter().any(is_node) {
-            return Ok(());
-        }
-        Err(CommandError::Input(
-            "agents on other nodes than the orchestrator's need certificates: create them and pass their directory with --tls \
-             (docs/slurm.md), or run all jobs on one node with '-- --nodelist=NODE'"
-                .to_owned(),
-        ))
-    }
-}
-
-/// A path as text for a script.
-fn text(path: &Path) -> Result<String, CommandError> {
-    let text = path.to_str().filter(|text| !text.contains('\n'));
-    text.map(str::to_owned).ok_or_else(|| {
-        CommandError::Input(format!(
-            "{}: a path in a job script must be UTF-8 without line breaks",
-            path.display()
-        ))
-    })
 }

@@ -87,16 +87,6 @@ pub fn write(path: &Path, text: &str) -> Result<(), CommandError> {
     file.finish()
 }
 
-/// Quotes a word for the shell.
-pub fn quoted(word: &str) -> String {
-    let plain = |c: char| c.is_ascii_alphanumeric() || "-_=./:,@%+".contains(c);
-    if !word.is_empty() && word.chars().all(plain) {
-        word.to_owned()
-    } else {
-        format!("'{}'", word.replace('\'', "'\\''"))
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use std::process::Command;
@@ -129,15 +119,5 @@ mod tests {
             let checked = Command::new("bash").args(["-n", "-c", &text]).output().unwrap();
             assert!(checked.status.success(), "{name}: {}", String::from_utf8_lossy(&checked.stderr));
         }
-    }
-
-    #[test]
-    fn quoted_words_reach_a_command_unchanged() {
-        for word in ["", "a b", "it's", "$HOME", "`x`", "a\\b", "x\ny", "postgres://u@h/d?schema=s&x=1"] {
-            let text = format!("printf %s {}", quoted(word));
-            let output = Command::new("bash").args(["-c", &text]).output().unwrap();
-            assert_eq!(String::from_utf8(output.stdout).unwrap(), word);
-        }
-        assert_eq!(quoted("/a/b-c.toml"), "/a/b-c.toml");
     }
 }

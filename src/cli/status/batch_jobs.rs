@@ -4,13 +4,15 @@ use std::collections::BTreeMap;
 use std::io::{self, Write};
 use std::time::Duration;
 
-use orchestrator::slurm::{JobPhase, Role, SlurmCommands, SlurmError, SlurmJob};
+use orchestrator::batch::{
+    BatchError, BatchScheduler, CampaignJob, CustomCommands, JobId, JobPhase, JobRecords, Role, SlurmCommands,
+};
 use serde_json::{Value, json};
 use store::Location;
 use tokio::time::timeout;
 
 use super::page::StatusLayout;
-use crate::cli::launch::{FOLDER, job_names};
+use crate::cli::launch::{CUSTOM_FOLDER, FOLDER, job_names};
 use crate::output::TextTable;
 
 /// How long `calmwalk status` waits for the batch system.
@@ -22,7 +24,7 @@ pub enum BatchJobs {
     /// There is no batch system, or it has no jobs of this campaign.
     None,
     /// Jobs with the exit codes of failed ones.
-    Known(Vec<(SlurmJob, Option<String>)>),
+    Known(Vec<(CampaignJob, Option<String>)>),
     /// The batch system gives no answer, for this reason.
     Unknown(String),
 }
@@ -30,21 +32,26 @@ pub enum BatchJobs {
 impl BatchJobs {
     /// Queries the batch system.
     pub async fn query(location: &Location) -> Self {
+        let schedulers = match schedulers(location) {
+            Ok(schedulers) => schedulers,
+            Err(error) => return Self::Unknown(error.to_string()),
+        };
         let location = match location {
-            // Without job scripts, the campaign was never launched.
-            Location::Directory(directory) if !directory.join(FOLDER).is_dir() => return Self::None,
             Location::Directory(directory) => {
                 Location::Directory(directory.canonicalize().unwrap_or_else(|_| directory.clone()))
             }
             Location::Server(url) => Location::Server(url.clone()),
         };
-        match timeout(TIMEOUT, query_slurm(&location)).await {
-            Ok(Ok(jobs)) if jobs.is_empty() => Self::None,
-            Ok(Ok(jobs)) => Self::Known(jobs),
-            Ok(Err(error)) if error.is_missing() => Self::None,
-            Ok(Err(error)) => Self::Unknown(error.to_string()),
-            Err(_) => Self::Unknown(format!("no answer within {} s", TIMEOUT.as_secs())),
+        let mut all = Vec::new();
+        for scheduler in schedulers {
+            match timeout(TIMEOUT, query_jobs(&scheduler, &location)).await {
+                Ok(Ok(jobs)) => all.extend(jobs),
+                Ok(Err(error)) if error.is_missing() => {}
+                Ok(Err(error)) => return Self::Unknown(error.to_string()),
+                Err(_) => return Self::Unknown(format!("no answer within {} s", TIMEOUT.as_secs())),
+            }
         }
+        if all.is_empty() { Self::None } else { Self::Known(all) }
     }
 
     /// Adds the jobs to the JSON output.
@@ -60,15 +67,17 @@ impl BatchJobs {
     pub fn write(&self, out: &mut dyn Write, page: &StatusLayout) -> io::Result<()> {
         let jobs = match self {
             Self::None => return Ok(()),
-            Self::Unknown(why) => return writeln!(out, "\njobs        no answer from Slurm: {why}"),
+            Self::Unknown(why) => {
+                return writeln!(out, "\njobs        no answer from the batch system: {why}");
+            }
             Self::Known(jobs) => jobs,
         };
-        let runs = |job: &SlurmJob| job.role != Role::Orchestrator && job.phase() == JobPhase::Running;
+        let runs = |job: &CampaignJob| job.role != Role::Orchestrator && job.phase() == JobPhase::Running;
         let mut shown: Vec<_> = jobs.iter().collect();
         if shown.len() > page.others {
             shown.sort_by_key(|(job, _)| (runs(job), job.role));
             shown.truncate(page.others);
-            shown.sort_by_key(|(job, _)| (job.role, job.id));
+            shown.sort_by_key(|(job, _)| (job.role, &job.id));
         }
         let mut table = TextTable::new(&["job", ">id", "state", "node", "since", ">time left", "remark"]);
         for (job, code) in &shown {
@@ -78,29 +87,46 @@ impl BatchJobs {
     }
 }
 
+/// The batch systems on which a campaign was launched: without job scripts, it never was. Jobs of a custom one are recorded in the
+/// directory of the campaign.
+fn schedulers(location: &Location) -> Result<Vec<BatchScheduler>, BatchError> {
+    let slurm = BatchScheduler::Slurm(SlurmCommands::with_timeout(TIMEOUT));
+    let Location::Directory(directory) = location else { return Ok(vec![slurm]) };
+    let folder = directory.join(CUSTOM_FOLDER);
+    let custom = JobRecords::read(&folder)?.map(|records| {
+        let commands = CustomCommands::new(records.scheduler, &folder, TIMEOUT);
+        BatchScheduler::Custom(Box::new(commands))
+    });
+    Ok(directory.join(FOLDER).is_dir().then_some(slurm).into_iter().chain(custom).collect())
+}
+
 /// Active jobs, and for each role without an active job the last one that ended.
-async fn query_slurm(location: &Location) -> Result<Vec<(SlurmJob, Option<String>)>, SlurmError> {
-    let slurm = SlurmCommands::with_timeout(TIMEOUT);
-    let mut jobs = slurm.jobs(&job_names(location)).await?;
-    let mut last: BTreeMap<Role, (bool, u64)> = BTreeMap::new();
+async fn query_jobs(
+    scheduler: &BatchScheduler,
+    location: &Location,
+) -> Result<Vec<(CampaignJob, Option<String>)>, BatchError> {
+    let mut jobs = scheduler.jobs(&job_names(location)).await?;
+    let mut last: BTreeMap<Role, (bool, JobId)> = BTreeMap::new();
     for job in &jobs {
-        let found = (job.phase() != JobPhase::Over, job.id);
-        let last = last.entry(job.role).or_insert(found);
-        *last = found.max(*last);
+        let found = (job.phase() != JobPhase::Over, job.id.clone());
+        if last.get(&job.role).is_none_or(|last| *last < found) {
+            last.insert(job.role, found);
+        }
     }
-    jobs.retain(|job| job.phase() != JobPhase::Over || last.get(&job.role) == Some(&(false, job.id)));
-    jobs.sort_by_key(|job| (job.role, job.id));
+    let is_last = |job: &CampaignJob| last.get(&job.role).is_some_and(|(lives, id)| !lives && *id == job.id);
+    jobs.retain(|job| job.phase() != JobPhase::Over || is_last(job));
+    jobs.sort_by_key(|job| (job.role, job.id.clone()));
     let mut known = Vec::new();
     for job in jobs {
         let failed = job.phase() == JobPhase::Over && job.state != "COMPLETED";
-        // Slurm may no longer know the job.
-        let code = if failed { slurm.exit_code(job.id).await.ok().flatten() } else { None };
+        // The batch system may no longer know the job.
+        let code = if failed { scheduler.exit_code(&job.id).await.ok().flatten() } else { None };
         known.push((job, code));
     }
     Ok(known)
 }
 
-fn line(job: &SlurmJob, code: Option<&str>) -> Vec<String> {
+fn line(job: &CampaignJob, code: Option<&str>) -> Vec<String> {
     let has_started = job.phase() != JobPhase::Pending;
     let reason = job.reason.clone().unwrap_or_default();
     let remark = match (job.phase(), code) {
@@ -120,13 +146,15 @@ fn line(job: &SlurmJob, code: Option<&str>) -> Vec<String> {
     ]
 }
 
-fn as_json(job: &SlurmJob, code: &Option<String>) -> Value {
-    let SlurmJob { id, role, state, nodes, start, time_left, walkers, reason } = job;
+fn as_json(job: &CampaignJob, code: &Option<String>) -> Value {
+    let CampaignJob { id, role, state, nodes, start, time_left, walkers, reason } = job;
     let (kind, number) = match role {
         Role::Orchestrator => ("orchestrator", None),
         Role::Agent(number) => ("agent", Some(number)),
         Role::Labeller(number) => ("labeller", Some(number)),
     };
+    // An id that is no number is text.
+    let id = id.number().map_or_else(|| json!(id.as_str()), |number| json!(number));
     json!({
         "kind": kind, "number": number, "id": id, "state": state, "node": nodes, "start": start,
         "time_left": time_left, "walkers": walkers, "reason": reason, "exit_code": code,
@@ -139,9 +167,9 @@ mod tests {
 
     const PAGE: StatusLayout = StatusLayout { walks: 8, others: 8, few: 8, width: 120 };
 
-    fn job(id: u64, role: Role, state: &str) -> SlurmJob {
-        SlurmJob {
-            id,
+    fn job(id: u64, role: Role, state: &str) -> CampaignJob {
+        CampaignJob {
+            id: id.into(),
             role,
             state: state.into(),
             nodes: "node7".into(),

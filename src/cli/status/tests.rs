@@ -10,7 +10,7 @@ use monitor::label_queue::LabelQueue;
 use monitor::mixture_values::MixtureValues;
 use monitor::provenance::Provenance;
 use monitor::snapshot::FORMAT;
-use orchestrator::slurm::{Role, SlurmJob};
+use orchestrator::batch::{CampaignJob, Role};
 use serde_json::{Value, json};
 use store::records::{STALENESS, TRAINING_FRAMES};
 use store::{
@@ -177,9 +177,9 @@ fn status() -> CampaignStatus {
     }
 }
 
-fn job() -> (SlurmJob, Option<String>) {
-    let job = SlurmJob {
-        id: 1_234_567,
+fn job() -> (CampaignJob, Option<String>) {
+    let job = CampaignJob {
+        id: 1_234_567.into(),
         role: Role::Agent(3),
         state: "PENDING".into(),
         nodes: "node7".into(),

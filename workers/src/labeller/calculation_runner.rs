@@ -32,9 +32,11 @@ const END: &str = "end.json";
 /// Time between two checks of memory use and of ended processes.
 const POLL_INTERVAL: Duration = Duration::from_millis(500);
 /// Environment variable in which Slurm gives the node of a job.
-const NODE_VARIABLE: &str = "SLURMD_NODENAME";
-/// Slurm kills the processes of a job one after the other: the runner may outlive its program for this time.
-const SLURM_KILL_TIME: Duration = Duration::from_secs(5);
+const SLURM_NODE_VARIABLE: &str = "SLURMD_NODENAME";
+/// Environment variable in which the script of a job gives its node to the runner.
+pub(super) const NODE_VARIABLE: &str = "CALMWALK_NODE";
+/// A batch system kills the processes of a job one after the other: the runner may outlive its program for this time.
+const JOB_KILL_TIME: Duration = Duration::from_secs(5);
 /// Written there by the second process if it could not execute the program.
 const NOT_STARTED: &str = "not-started";
 
@@ -224,10 +226,11 @@ impl Calculation {
         let (limit, memory) = self.wait(program, &mut children, started)?;
         let status = children.terminate()?;
         let seconds = started.elapsed().as_secs_f64();
-        let node = std::env::var(NODE_VARIABLE).ok();
+        let node = [SLURM_NODE_VARIABLE, NODE_VARIABLE].iter().find_map(|name| std::env::var(name).ok());
         if node.is_some() && limit.is_none() && !status.success() {
-            // If Slurm is killing the job, this process is killed here as well, and Slurm reports the reason.
-            std::thread::sleep(SLURM_KILL_TIME);
+            // If the batch system is killing the job, this process is killed here as well, and the batch system reports the
+            // reason.
+            std::thread::sleep(JOB_KILL_TIME);
         }
         let how = match (self.not_started(), limit) {
             (Some(number), _) => EndReason::NotStarted(number),

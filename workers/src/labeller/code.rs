@@ -14,18 +14,20 @@ use store::{Store, StoreError};
 use tokio::sync::OnceCell;
 use tokio_util::sync::CancellationToken;
 
+use super::batch_access::BatchAccess;
 use super::blocking::blocking;
 use super::calculation_handle::CalculationHandle;
 use super::calculation_request::{CalculationNote, CalculationRequest};
 use super::calculation_runner::{Calculation, CalculationEnd, EndReason, WORK};
 use super::calculation_state::CalculationState;
+use super::custom_jobs::CustomJob;
 use super::failure_classes::failure_classes;
 use super::file_error::file_error;
 use super::label_attempt::{EndedCalculation, LabelAttempt, SingleLabel};
 use super::local;
 use super::prepare::{PreparedInput, prepare, read, write};
 use super::scratch::{self, ScratchRoot};
-use super::slurm::{self, Slurm};
+use super::slurm;
 use super::{BatchSystem, ExecutionSettings, RunnerCommand, log, private_directory, retry_until_written};
 
 /// Minimum time allowed for reading results, even if the calculation used up its time limit.
@@ -41,7 +43,7 @@ pub struct CodeMethod {
     /// Where the calculations of this campaign are.
     root: OnceCell<ScratchRoot>,
     current: Mutex<Option<CurrentCalculation>>,
-    slurm: Slurm,
+    batch: BatchAccess,
 }
 
 /// A calculation that this labeller waits for.
@@ -55,6 +57,7 @@ struct CurrentCalculation {
 enum PreparedCalculation {
     Local(local::PreparedRunner),
     Slurm(slurm::CalculationJob),
+    Custom(CustomJob),
 }
 
 impl CodeMethod {
@@ -63,9 +66,8 @@ impl CodeMethod {
         code: Box<dyn DftBackend>,
         execution: ExecutionSettings,
     ) -> Self {
-        let (root, current, slurm) =
-            (OnceCell::new(), Mutex::default(), Slurm::new(&execution.pass_environment));
-        Self { code: code.into(), execution, runner, root, current, slurm }
+        let (root, current, batch) = (OnceCell::new(), Mutex::default(), BatchAccess::new(&execution));
+        Self { code: code.into(), execution, runner, root, current, batch }
     }
 
     pub(super) fn size(&self, structure: &Structure) -> CalculationSize {
@@ -123,8 +125,8 @@ impl CodeMethod {
             Some((handle, found)) => {
                 self.take(handle.clone(), None);
                 record(&handle).await?;
-                if let (CalculationHandle::Slurm(job), CalculationState::Ready) = (&handle, found) {
-                    self.slurm.submit(job).await?;
+                if found == CalculationState::Ready {
+                    handle.submit(&self.batch).await?;
                 }
                 handle
             }
@@ -199,7 +201,7 @@ impl CodeMethod {
             let campaign = retry_until_written(stop, || store.campaign()).await?.id;
             let root = ScratchRoot::for_campaign(&self.execution.scratch(), campaign);
             root.prepare()?;
-            root.cleanup(store, self.execution.keep, &self.slurm, stop).await?;
+            root.cleanup(store, self.execution.keep, &self.batch, stop).await?;
             Ok(root)
         };
         self.root.get_or_try_init(make).await
@@ -224,14 +226,14 @@ impl CodeMethod {
         let once: Vec<_> = known.filter(|handle| named.insert(handle.directory().to_owned())).collect();
         let mut found = None;
         for handle in once {
-            match handle.inspect(&self.slurm).await? {
+            match handle.inspect(&self.batch).await? {
                 CalculationState::Elsewhere => {}
                 CalculationState::Ended(CalculationEnd { how: EndReason::NotStarted(_), .. })
                 | CalculationState::Gone => {
-                    handle.clear(&self.slurm).await?;
+                    handle.clear(&self.batch).await?;
                 }
                 look if found.is_none() => found = Some((handle, look)),
-                _ => handle.clear(&self.slurm).await?,
+                _ => handle.clear(&self.batch).await?,
             }
         }
         Ok(found)
@@ -246,7 +248,9 @@ impl CodeMethod {
     ) -> Result<PreparedCalculation, StoreError> {
         let PreparedInput { input, time_limit, memory_limit, avoids_nodes, .. } = prepared;
         let mut environment: Vec<_> = input.environment.clone().into_iter().collect();
-        environment.push(("CALMWALK_CORES".to_owned(), self.execution.cores.to_string()));
+        let (cores, gpus) = (self.execution.cores, self.execution.gpus);
+        environment.push(("CALMWALK_CORES".to_owned(), cores.to_string()));
+        environment.extend((gpus > 0).then(|| ("CALMWALK_GPUS".to_owned(), gpus.to_string())));
         let calculation = Calculation {
             directory: directory.to_owned(),
             command: input.command.clone(),
@@ -264,12 +268,18 @@ impl CodeMethod {
         let ready = match self.execution.batch_system {
             None => local::PreparedRunner::spawn(calculation).map(PreparedCalculation::Local),
             Some(BatchSystem::Slurm) => {
-                let (cores, options) = (self.execution.cores, self.execution.batch_options.as_slice());
+                let options = self.execution.batch_options.as_slice();
                 let avoid = if *avoids_nodes { failed_on } else { &[] };
-                let requirements = slurm::JobRequirements { cores, options, avoid };
-                let job = self.slurm.job(directory).await?;
+                let requirements = slurm::JobRequirements { cores, gpus, options, avoid };
+                let job = self.batch.slurm.job(directory).await?;
                 slurm::write(calculation, &requirements).map(|()| PreparedCalculation::Slurm(job))
             }
+            Some(BatchSystem::Custom) => match &self.batch.custom {
+                Some(custom) => custom.prepare(calculation, cores, gpus).map(PreparedCalculation::Custom),
+                None => {
+                    Err(io::Error::other("label.batch_system is \"custom\", but there is no launch.custom"))
+                }
+            },
         };
         ready.map_err(|error| unused(file_error(directory, error)))
     }
@@ -282,9 +292,9 @@ impl CodeMethod {
                 let runner = ready.start().map_err(|error| file_error(handle.directory(), error))?;
                 self.take(handle.clone(), Some(runner));
             }
-            PreparedCalculation::Slurm(job) => {
+            PreparedCalculation::Slurm(_) | PreparedCalculation::Custom(_) => {
                 self.take(handle.clone(), None);
-                self.slurm.submit(&job).await?;
+                handle.submit(&self.batch).await?;
             }
         }
         Ok(handle)
@@ -299,7 +309,7 @@ impl CodeMethod {
         time_limit: f64,
         stop: &CancellationToken,
     ) -> Result<Option<LabelAttempt>, StoreError> {
-        let Some(end) = handle.wait(&self.slurm).await? else {
+        let Some(end) = handle.wait(&self.batch).await? else {
             return self.lost_calculation(handle).await.map(Some);
         };
         let left = Duration::try_from_secs_f64(time_limit - end.seconds).unwrap_or_default();
@@ -353,7 +363,7 @@ impl CodeMethod {
 
     /// The runner was killed, which says nothing about the job.
     async fn lost_calculation(&self, handle: CalculationHandle) -> Result<LabelAttempt, StoreError> {
-        handle.clear(&self.slurm).await?;
+        handle.clear(&self.batch).await?;
         self.reap();
         let result =
             Err(FailureClass::NodeFailure.with_message("the process that kept the calculation was killed"));
@@ -377,7 +387,7 @@ impl CodeMethod {
     /// Ends a calculation that was recorded in this form, and removes what is left of it.
     pub(super) async fn give_up(&self, calculation: &str) -> Result<(), StoreError> {
         match CalculationHandle::parse(calculation) {
-            Some(handle) => handle.clear(&self.slurm).await,
+            Some(handle) => handle.clear(&self.batch).await,
             None => Ok(()),
         }
     }
@@ -386,7 +396,7 @@ impl CodeMethod {
     pub(super) async fn cancel(&self) -> Result<(), StoreError> {
         let handle = self.current().as_ref().map(|current| current.handle.clone());
         if let Some(handle) = handle {
-            handle.clear(&self.slurm).await?;
+            handle.clear(&self.batch).await?;
             self.reap();
             if let Some(root) = handle.directory().parent() {
                 scratch::remove_empty(root);
@@ -436,7 +446,7 @@ fn failed_nodes(failed: &[String]) -> Vec<String> {
     let failed = failed.iter().filter_map(|text| CalculationHandle::parse(text));
     let nodes = failed.filter_map(|handle| match handle {
         CalculationHandle::Slurm(job) => job.node,
-        CalculationHandle::Local(_) => None,
+        CalculationHandle::Local(_) | CalculationHandle::Custom(_) => None,
     });
     nodes.collect::<BTreeSet<_>>().into_iter().collect()
 }
@@ -460,6 +470,7 @@ impl PreparedCalculation {
         match self {
             Self::Local(ready) => CalculationHandle::Local(ready.handle.clone()),
             Self::Slurm(job) => CalculationHandle::Slurm(job.clone()),
+            Self::Custom(job) => CalculationHandle::Custom(job.clone()),
         }
     }
 }

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use ::batch::CustomScheduler;
 use dft::PassedEnvironment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -12,6 +13,9 @@ use serde::{Deserialize, Serialize};
 pub struct ExecutionSettings {
     /// Cores per calculation, given to the program as `CALMWALK_CORES`. Core-hours are counted with it.
     pub cores: u32,
+    /// GPUs per calculation, given to the program as `CALMWALK_GPUS`; 0 for none. A batch system is asked for them.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub gpus: u32,
     /// Maximum time of a calculation, s.
     pub time_limit: f64,
     /// Maximum memory of all processes of a calculation together, GB (10⁹ bytes); `None` for no limit.
@@ -30,6 +34,9 @@ pub struct ExecutionSettings {
     /// Further options of its jobs, in the syntax of the batch system's command.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub batch_options: Vec<String>,
+    /// The batch system of [`BatchSystem::Custom`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scheduler: Option<Box<CustomScheduler>>,
 }
 
 /// A batch system that runs calculations as jobs.
@@ -38,6 +45,8 @@ pub struct ExecutionSettings {
 pub enum BatchSystem {
     /// Slurm.
     Slurm,
+    /// The one that `launch.custom` describes.
+    Custom,
 }
 
 /// Which directories of calculations to pack into the store; all others are removed.
@@ -64,10 +73,15 @@ impl KeepDirectories {
     }
 }
 
+fn is_zero(number: &u32) -> bool {
+    *number == 0
+}
+
 impl Default for ExecutionSettings {
     fn default() -> Self {
         Self {
             cores: 1,
+            gpus: 0,
             time_limit: 86_400.0,
             memory: None,
             scratch: None,
@@ -75,6 +89,7 @@ impl Default for ExecutionSettings {
             pass_environment: PassedEnvironment::default(),
             batch_system: None,
             batch_options: Vec::new(),
+            scheduler: None,
         }
     }
 }

@@ -3,12 +3,14 @@
 //! [`run`] is a task within a process. [`serve`] runs a labeller as a process of its own, which outlives its
 //! orchestrator.
 
+mod batch_access;
 mod blocking;
 mod calculation_handle;
 mod calculation_request;
 mod calculation_runner;
 mod calculation_state;
 mod code;
+mod custom_jobs;
 mod energies;
 mod execution;
 mod failure_classes;

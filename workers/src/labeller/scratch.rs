@@ -14,12 +14,13 @@ use store::{Store, StoreError};
 use tokio_util::sync::CancellationToken;
 use wire::CampaignId;
 
+use super::batch_access::BatchAccess;
 use super::blocking::blocking;
 use super::calculation_handle::CalculationHandle;
 use super::calculation_state::CalculationState;
 use super::execution::KeepDirectories;
 use super::file_error::file_error;
-use super::slurm::{self, Slurm};
+use super::slurm;
 use super::{local, pack, private_directory, retry_until_written};
 
 /// Directories younger than this may still be in use and are not removed.
@@ -79,13 +80,13 @@ impl ScratchRoot {
         &self,
         store: &Store,
         keep: KeepDirectories,
-        slurm: &Slurm,
+        batch: &BatchAccess,
         stop: &CancellationToken,
     ) -> Result<(), StoreError> {
         for root in self.all()? {
             let entries = fs::read_dir(&root).map_err(|error| file_error(&root, error))?;
             for directory in entries.flatten().map(|entry| entry.path()).filter(|path| is_old(path)) {
-                cleanup_one(store, &directory, keep, slurm, stop).await?;
+                cleanup_one(store, &directory, keep, batch, stop).await?;
             }
         }
         Ok(())
@@ -139,7 +140,7 @@ async fn cleanup_one(
     store: &Store,
     directory: &Path,
     keep: KeepDirectories,
-    slurm: &Slurm,
+    batch: &BatchAccess,
     stop: &CancellationToken,
 ) -> Result<(), StoreError> {
     let Some((job, attempt)) = job_and_attempt(directory) else { return Ok(()) };
@@ -148,7 +149,7 @@ async fn cleanup_one(
     let Some(past) = past.filter(|past| !past.wanted) else { return Ok(()) };
     let handle = past.calculation.as_deref().and_then(CalculationHandle::parse);
     let is_over = match handle.filter(|handle| handle.directory() == directory) {
-        Some(handle) => !matches!(handle.inspect(slurm).await?, CalculationState::Running),
+        Some(handle) => !matches!(handle.inspect(batch).await?, CalculationState::Running),
         // Its creator was killed before anything started.
         None => true,
     };

@@ -22,7 +22,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use ::slurm::{JobPhase, SlurmClient, SlurmError};
+use ::batch::{JobPhase, SlurmClient, SlurmError};
 use dft::PassedEnvironment;
 use store::StoreError;
 use tokio::sync::OnceCell;
@@ -38,7 +38,7 @@ use squeue::{SqueueJob, Traces};
 use squeue_cache::SQUEUE_INTERVAL;
 
 pub(super) use job::CalculationJob;
-pub(super) use script::{JobRequirements, write};
+pub(super) use script::{JobRequirements, runner, write};
 pub(super) use squeue_cache::remove_cache;
 
 /// Timeout of Slurm's commands.
@@ -208,7 +208,7 @@ impl Slurm {
             // What ends was reported so before.
             let ids: Vec<_> = living
                 .filter(|reported| reported.phase() != JobPhase::Completing)
-                .map(|reported| reported.id)
+                .map(|reported| reported.id.clone())
                 .collect();
             self.commands.cancel(&ids).await.map_err(|error| job_error(job, error))?;
             if jobs.iter().all(|reported| reported.phase() == JobPhase::Over)
@@ -252,10 +252,10 @@ impl Slurm {
     }
 }
 
-const SCRATCH_NOT_SHARED: &str =
+pub(super) const SCRATCH_NOT_SHARED: &str =
     "label.scratch must be a directory that this host and every node see under the same name";
 
-fn own_user() -> u32 {
+pub(super) fn own_user() -> u32 {
     rustix::process::getuid().as_raw()
 }
 
@@ -264,7 +264,7 @@ fn job_error(job: &CalculationJob, why: impl ToString) -> StoreError {
 }
 
 /// Makes files from other hosts visible: a network file system refreshes a directory when a file is created in it.
-async fn settle(directory: &Path) {
+pub(super) async fn settle(directory: &Path) {
     sleep(SETTLE_TIME).await;
     let new = directory.join("look");
     // A program may have left a file of that name, and opening a pipe would block.

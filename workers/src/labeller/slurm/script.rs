@@ -20,6 +20,7 @@ const EXCLUDE: &str = "#SBATCH --exclude=";
 /// Resources of a job.
 pub(in super::super) struct JobRequirements<'a> {
     pub cores: u32,
+    pub gpus: u32,
     /// Options set by the user.
     pub options: &'a [String],
     /// Nodes on which it failed.
@@ -47,6 +48,7 @@ fn script(calculation: &Calculation, requirements: &JobRequirements<'_>) -> io::
         format!("--time={minutes:.0}"),
     ];
     options.extend(calculation.memory_limit.map(|bytes| format!("--mem={}M", bytes.div_ceil(MEBIBYTE))));
+    options.extend((requirements.gpus > 0).then(|| format!("--gres=gpu:{}", requirements.gpus)));
     options.extend(requirements.options.iter().cloned());
     let mut script = "#!/bin/sh\n".to_owned();
     for option in options {
@@ -65,7 +67,7 @@ fn script(calculation: &Calculation, requirements: &JobRequirements<'_>) -> io::
 }
 
 /// The runner's command as a node can execute it.
-fn runner(command: &RunnerCommand) -> io::Result<String> {
+pub(in super::super) fn runner(command: &RunnerCommand) -> io::Result<String> {
     let program = match command.program.starts_with("/proc/self") {
         true => fs::read_link(&command.program)?,
         false => command.program.clone(),
@@ -137,12 +139,22 @@ mod tests {
         let home = tempfile::tempdir().unwrap();
         let options = ["--partition=long".to_owned()];
         let avoid = ["n1".to_owned(), "n2".to_owned()];
-        write(calculation(home.path()), &JobRequirements { cores: 4, options: &options, avoid: &avoid })
-            .unwrap();
+        write(
+            calculation(home.path()),
+            &JobRequirements { cores: 4, gpus: 2, options: &options, avoid: &avoid },
+        )
+        .unwrap();
         let text = fs::read_to_string(home.path().join(SCRIPT)).unwrap();
         let directives: Vec<_> = text.lines().filter_map(|line| line.strip_prefix("#SBATCH ")).collect();
-        let expected =
-            ["--nodes=1", "--ntasks=4", "--time=61", "--mem=1908M", "--partition=long", "--exclude=n1,n2"];
+        let expected = [
+            "--nodes=1",
+            "--ntasks=4",
+            "--time=61",
+            "--mem=1908M",
+            "--gres=gpu:2",
+            "--partition=long",
+            "--exclude=n1,n2",
+        ];
         assert_eq!(directives, expected);
         assert!(text.contains(r"'/opt/it'\''s/calmwalk' 'calculation-runner' < order.json"), "{text}");
         let order = fs::read_to_string(home.path().join(REQUEST)).unwrap();

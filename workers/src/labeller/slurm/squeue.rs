@@ -4,7 +4,7 @@ use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use ::slurm::{JobPhase, SlurmError};
+use ::batch::{JobId, JobPhase, SlurmError};
 use dft::Exit;
 
 use super::super::calculation_runner::{CalculationEnd, EndReason};
@@ -14,7 +14,7 @@ use super::job::{BEGUN, LOG};
 /// A job, as `squeue` shows it.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct SqueueJob {
-    pub id: u64,
+    pub id: JobId,
     /// State in Slurm's terms, such as `RUNNING`.
     state: String,
     /// Nodes on which it runs or ran.
@@ -38,7 +38,7 @@ impl SqueueJob {
         let fields: Vec<_> = line.splitn(5, '|').collect();
         let [id, state, nodes, time, reason] = fields[..] else { return Err(unreadable()) };
         Ok(Self {
-            id: id.parse().map_err(|_| unreadable())?,
+            id: JobId::from(id.parse::<u64>().map_err(|_| unreadable())?),
             state: state.to_owned(),
             nodes: nodes.to_owned(),
             seconds: seconds(time),
@@ -171,7 +171,7 @@ mod tests {
     #[test]
     fn lines_of_squeue_are_read() {
         let job = SqueueJob::parse("12|RUNNING|node7|1-02:03:04|Node | failure").unwrap();
-        assert_eq!((job.id, job.phase(), job.seconds), (12, JobPhase::Running, 93_784.0));
+        assert_eq!((job.id.number(), job.phase(), job.seconds), (Some(12), JobPhase::Running, 93_784.0));
         assert_eq!(job.to_string(), "job 12 is RUNNING on node7 (Node | failure)");
         assert!(
             SqueueJob::parse("12|RUNNING|node7").is_err()

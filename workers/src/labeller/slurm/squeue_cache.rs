@@ -7,7 +7,7 @@ use std::fs;
 use std::path::Path;
 use std::time::Duration;
 
-use ::slurm::SlurmClient;
+use ::batch::SlurmClient;
 use dft::result_file;
 
 use super::job::CalculationJob;

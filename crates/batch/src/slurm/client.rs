@@ -6,20 +6,16 @@ use std::process::{Output, Stdio};
 use std::time::Duration;
 
 use tokio::process::Command;
-use tokio::time::sleep;
 
-use crate::queue_full;
+use super::queue_full;
+use crate::full_pause::FullPause;
+use crate::job_id::JobId;
 
 /// Maximum number of jobs per call of `scancel`.
 const JOBS_PER_CANCEL: usize = 200;
 /// Variables that locate Slurm and identify the user. All other Slurm variables belong to a job that this
 /// process may be part of; commands would take them for options.
 const KEPT_VARIABLES: [&str; 3] = ["SLURM_CONF", "SLURM_CONF_SERVER", "SLURM_JWT"];
-
-/// First time between two tries to submit a job while Slurm accepts none.
-const MIN_FULL_PAUSE: Duration = Duration::from_secs(2);
-/// Longest such time.
-const MAX_FULL_PAUSE: Duration = Duration::from_secs(60);
 
 /// Slurm, through its commands on this host.
 #[derive(Clone, Debug)]
@@ -106,8 +102,8 @@ impl SlurmClient {
     }
 
     /// The exit code of a finished job as `code:signal`, while Slurm still knows the job.
-    pub async fn exit_code(&self, id: u64) -> Result<Option<String>, SlurmError> {
-        let text = self.run("scontrol", ["--oneliner", "show", "job", &id.to_string()]).await?;
+    pub async fn exit_code(&self, id: &JobId) -> Result<Option<String>, SlurmError> {
+        let text = self.run("scontrol", ["--oneliner", "show", "job", id.as_str()]).await?;
         let code = text.split_whitespace().find_map(|word| word.strip_prefix("ExitCode="));
         Ok(code.map(str::to_owned))
     }
@@ -133,8 +129,8 @@ impl SlurmClient {
         &self,
         arguments: &[impl AsRef<OsStr>],
         on_full: impl FnOnce(&SlurmError),
-    ) -> Result<u64, SlurmError> {
-        let (mut on_full, mut pause) = (Some(on_full), MIN_FULL_PAUSE);
+    ) -> Result<JobId, SlurmError> {
+        let (mut on_full, mut pause) = (Some(on_full), FullPause::new());
         loop {
             match self.try_submit(arguments).await {
                 Err(full @ SlurmError::Full { .. }) => {
@@ -144,12 +140,11 @@ impl SlurmClient {
                 }
                 result => return result,
             }
-            sleep(pause).await;
-            pause = (2 * pause).min(MAX_FULL_PAUSE);
+            pause.wait().await;
         }
     }
 
-    async fn try_submit(&self, arguments: &[impl AsRef<OsStr>]) -> Result<u64, SlurmError> {
+    async fn try_submit(&self, arguments: &[impl AsRef<OsStr>]) -> Result<JobId, SlurmError> {
         const SBATCH: &str = "sbatch";
         let arguments = arguments.iter().map(AsRef::as_ref);
         let mut command = self.command(SBATCH, [OsStr::new("--parsable")].into_iter().chain(arguments));
@@ -162,7 +157,7 @@ impl SlurmClient {
         };
         let text = self.answer(SBATCH, queue_full::submission(&mut command)).await.map_err(full)?;
         // With several clusters the name of the cluster follows.
-        let id = text.trim().split(';').next().and_then(|id| id.parse().ok());
+        let id = text.trim().split(';').next().and_then(|id| id.parse::<u64>().ok()).map(JobId::from);
         let expected = "a job id";
         id.ok_or_else(|| SlurmError::UnexpectedOutput {
             program: SBATCH,
@@ -173,9 +168,9 @@ impl SlurmClient {
 
     /// Cancels jobs: their processes get SIGTERM, and SIGKILL after Slurm's `KillWait`. Ignores jobs that have
     /// ended.
-    pub async fn cancel(&self, ids: &[u64]) -> Result<(), SlurmError> {
+    pub async fn cancel(&self, ids: &[JobId]) -> Result<(), SlurmError> {
         for ids in ids.chunks(JOBS_PER_CANCEL) {
-            let ids = ids.iter().map(u64::to_string);
+            let ids = ids.iter().map(JobId::to_string);
             self.run("scancel", ["--quiet".to_owned()].into_iter().chain(ids)).await?;
         }
         Ok(())

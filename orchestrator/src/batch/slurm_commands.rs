@@ -4,9 +4,9 @@ use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use ::slurm::{SlurmClient, SlurmError};
+use ::batch::{JobId, SlurmClient, SlurmError};
 
-use super::job::{JobNames, Role, SlurmJob, comment};
+use super::job::{CampaignJob, JobNames, Role, comment};
 use super::plan::Submission;
 
 /// Slurm's commands on this host.
@@ -18,7 +18,7 @@ pub struct SlurmCommands {
 /// Options of a submission that are the same for all jobs of a kind.
 #[derive(Clone, Debug)]
 pub struct JobOptions<'a> {
-    /// Job script.
+    /// Job script. A custom batch system needs no more than this, the walkers and the orchestrator's job.
     pub script: PathBuf,
     /// File for its output.
     pub log: PathBuf,
@@ -27,7 +27,7 @@ pub struct JobOptions<'a> {
     /// Number of walkers of an agent.
     pub walkers: u32,
     /// Job of the orchestrator; agents and labellers start after it.
-    pub orchestrator: Option<u64>,
+    pub orchestrator: Option<JobId>,
     /// Additional options of `sbatch`.
     pub options: &'a [String],
 }
@@ -40,18 +40,18 @@ impl SlurmCommands {
 
     /// The jobs of a campaign that belong to this user: all pending and running ones, and those that ended within the
     /// last minutes (`MinJobAge` in Slurm's configuration).
-    pub async fn jobs(&self, names: &JobNames) -> Result<Vec<SlurmJob>, SlurmError> {
-        let text = self.commands.queue(SlurmJob::FORMAT, &["--states=all"]).await?;
+    pub async fn jobs(&self, names: &JobNames) -> Result<Vec<CampaignJob>, SlurmError> {
+        let text = self.commands.queue(CampaignJob::FORMAT, &["--states=all"]).await?;
         let job = |line: &str| {
             let (found, expected) = (line.to_owned(), "what --format asks for");
             let unreadable = |()| SlurmError::UnexpectedOutput { program: "squeue", found, expected };
-            SlurmJob::parse(line, names).map_err(unreadable).transpose()
+            CampaignJob::parse(line, names).map_err(unreadable).transpose()
         };
         text.lines().filter_map(job).collect()
     }
 
     /// Exit code of an ended job as `code:signal`, while Slurm still knows it.
-    pub async fn exit_code(&self, id: u64) -> Result<Option<String>, SlurmError> {
+    pub async fn exit_code(&self, id: &JobId) -> Result<Option<String>, SlurmError> {
         self.commands.exit_code(id).await
     }
 
@@ -63,13 +63,13 @@ impl SlurmCommands {
         submission: &Submission,
         request: &JobOptions<'_>,
         on_full: impl FnOnce(&SlurmError),
-    ) -> Result<u64, SlurmError> {
+    ) -> Result<JobId, SlurmError> {
         self.commands.submit(&request.arguments(names, submission), on_full).await
     }
 
     /// Cancels jobs: each of their processes gets SIGTERM, and SIGKILL after Slurm's `KillWait`. Jobs that have already
     /// ended are not an error.
-    pub async fn cancel(&self, ids: &[u64]) -> Result<(), SlurmError> {
+    pub async fn cancel(&self, ids: &[JobId]) -> Result<(), SlurmError> {
         self.commands.cancel(ids).await
     }
 }
@@ -80,7 +80,7 @@ impl JobOptions<'_> {
         let role = submission.role;
         let mut dependency = vec!["singleton".to_owned()];
         dependency.extend(submission.after_end_of.iter().map(|id| format!("afterany:{id}")));
-        if let Some(id) = self.orchestrator.filter(|_| role != Role::Orchestrator) {
+        if let Some(id) = self.orchestrator.as_ref().filter(|_| role != Role::Orchestrator) {
             dependency.push(format!("after:{id}"));
         }
         let mut arguments: Vec<OsString> = self.options.iter().map(Into::into).collect();

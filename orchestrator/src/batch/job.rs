@@ -1,8 +1,8 @@
-//! Jobs: their names, and the output of `squeue`.
+//! Jobs: their names and states, and the output of `squeue`.
 
 use std::fmt;
 
-use ::slurm::JobPhase;
+use ::batch::{JobId, JobPhase};
 
 /// Role of a job in a campaign.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -21,14 +21,14 @@ pub struct JobNames {
     prefix: String,
 }
 
-/// A job, as shown by `squeue`.
+/// A job, as shown by `squeue`. Of a custom batch system only id, role, state and walkers are known.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct SlurmJob {
+pub struct CampaignJob {
     /// Job id.
-    pub id: u64,
+    pub id: JobId,
     /// Role.
     pub role: Role,
-    /// State as named by Slurm, for example `RUNNING`.
+    /// State as named by Slurm, for example `RUNNING`, whatever the batch system.
     pub state: String,
     /// Nodes; empty while it is pending.
     pub nodes: String,
@@ -93,7 +93,7 @@ impl JobNames {
     }
 }
 
-impl SlurmJob {
+impl CampaignJob {
     /// Format of `squeue`'s output, one line per job.
     pub(super) const FORMAT: &str = "%i|%T|%j|%N|%S|%L|%k|%r";
 
@@ -106,7 +106,7 @@ impl SlurmJob {
         let Some(role) = fields.get(2).and_then(|name| names.role(name)) else { return Ok(None) };
         let [id, state, _, nodes, start, time_left, comment, reason] = fields[..] else { return Err(()) };
         Ok(Some(Self {
-            id: id.parse().map_err(drop)?,
+            id: JobId::from(id.parse::<u64>().map_err(drop)?),
             role,
             state: state.to_owned(),
             nodes: nodes.to_owned(),
@@ -150,11 +150,11 @@ mod tests {
     fn lines_of_squeue_are_read() {
         let names = JobNames::new("1a");
         let line = "12|RUNNING|calmwalk-1a-agent-3|node7|2026-11-21T20:15:00|1-02:00:00|walkers=16|None";
-        let job = SlurmJob::parse(line, &names).unwrap().unwrap();
-        assert_eq!((job.id, job.role, job.phase()), (12, Role::Agent(3), JobPhase::Running));
+        let job = CampaignJob::parse(line, &names).unwrap().unwrap();
+        assert_eq!((job.id.number(), job.role, job.phase()), (Some(12), Role::Agent(3), JobPhase::Running));
         assert_eq!((job.walkers, job.reason), (Some(16), None));
         let line = "13|PENDING|calmwalk-1a-orchestrator||N/A|2:00|(null)|launch failed | requeued held";
-        let job = SlurmJob::parse(line, &names).unwrap().unwrap();
+        let job = CampaignJob::parse(line, &names).unwrap().unwrap();
         assert_eq!((job.role, job.phase(), job.walkers), (Role::Orchestrator, JobPhase::Pending, None));
         assert_eq!(job.reason.as_deref(), Some("launch failed | requeued held"));
     }
@@ -163,11 +163,11 @@ mod tests {
     fn other_jobs_are_skipped_and_incomplete_lines_are_errors() {
         let names = JobNames::new("1a");
         for line in ["", "12|RUNNING|relax|node7|N/A|1:00|(null)|None", "12_[1-3]|PENDING|a|b"] {
-            assert_eq!(SlurmJob::parse(line, &names), Ok(None), "{line}");
+            assert_eq!(CampaignJob::parse(line, &names), Ok(None), "{line}");
         }
         for line in ["12|RUNNING|calmwalk-1a-agent-3|node7", "x|RUNNING|calmwalk-1a-agent-3|n|N/A|1:00||None"]
         {
-            assert_eq!(SlurmJob::parse(line, &names), Err(()), "{line}");
+            assert_eq!(CampaignJob::parse(line, &names), Err(()), "{line}");
         }
     }
 }

@@ -1,14 +1,16 @@
 //! Submitted and cancelled jobs: explicit cases, then arbitrary launches while jobs start, end and are requeued.
 
-use orchestrator::slurm::{DesiredJobs, JobNames, JobPhase, Plan, Role, SlurmJob, Submission, plan};
+use orchestrator::batch::{
+    CampaignJob, DesiredJobs, JobId, JobNames, JobPhase, Plan, Role, Submission, plan,
+};
 use proptest::prelude::*;
 
 const WANTED: DesiredJobs = DesiredJobs { agents: 2, walkers: 4, labellers: 1 };
 
-fn job(id: u64, role: Role, state: &str) -> SlurmJob {
+fn job(id: u64, role: Role, state: &str) -> CampaignJob {
     let walkers = matches!(role, Role::Agent(_)).then_some(WANTED.walkers);
-    SlurmJob {
-        id,
+    CampaignJob {
+        id: id.into(),
         role,
         state: state.into(),
         nodes: String::new(),
@@ -19,8 +21,12 @@ fn job(id: u64, role: Role, state: &str) -> SlurmJob {
     }
 }
 
+fn ids(numbers: &[u64]) -> Vec<JobId> {
+    numbers.iter().copied().map(JobId::from).collect()
+}
+
 fn submission(role: Role, after_end_of: &[u64]) -> Submission {
-    Submission { role, after_end_of: after_end_of.into() }
+    Submission { role, after_end_of: ids(after_end_of) }
 }
 
 #[test]
@@ -69,7 +75,7 @@ fn undesired_jobs_are_cancelled() {
         job(6, Role::Labeller(0), "PENDING"),
         job(9, Role::Labeller(1), "COMPLETING"),
     ];
-    assert_eq!(plan(&WANTED, &jobs), Plan { cancel: vec![8, 2, 5], submit: vec![] });
+    assert_eq!(plan(&WANTED, &jobs), Plan { cancel: ids(&[8, 2, 5]), submit: vec![] });
 }
 
 #[test]
@@ -83,7 +89,7 @@ fn agents_with_another_number_of_walkers_are_replaced() {
     jobs[1].walkers = Some(8);
     // A site that does not keep comments.
     jobs[2].walkers = None;
-    let expected = Plan { cancel: vec![2], submit: vec![submission(Role::Agent(0), &[2])] };
+    let expected = Plan { cancel: ids(&[2]), submit: vec![submission(Role::Agent(0), &[2])] };
     assert_eq!(plan(&WANTED, &jobs), expected);
 }
 
@@ -98,8 +104,8 @@ fn job_names_match_the_plan() {
 /// A job in a batch system that supports `singleton` and `afterany`.
 #[derive(Clone, Debug)]
 struct Known {
-    job: SlurmJob,
-    after: Vec<u64>,
+    job: CampaignJob,
+    after: Vec<JobId>,
     requeue: bool,
 }
 
@@ -117,8 +123,8 @@ impl System {
         self.jobs.push(Known { job, after: submission.after_end_of, requeue: false });
     }
 
-    fn cancel(&mut self, id: u64) {
-        if let Some(known) = self.jobs.iter_mut().find(|known| known.job.id == id) {
+    fn cancel(&mut self, id: &JobId) {
+        if let Some(known) = self.jobs.iter_mut().find(|known| known.job.id == *id) {
             known.requeue = false;
             match known.job.phase() {
                 JobPhase::Pending => known.job.state = "CANCELLED".into(),
@@ -128,8 +134,8 @@ impl System {
         }
     }
 
-    fn phase(&self, id: u64) -> JobPhase {
-        self.jobs.iter().find(|known| known.job.id == id).map_or(JobPhase::Over, |known| known.job.phase())
+    fn phase(&self, id: &JobId) -> JobPhase {
+        self.jobs.iter().find(|known| known.job.id == *id).map_or(JobPhase::Over, |known| known.job.phase())
     }
 
     fn may_begin(&self, known: &Known) -> bool {
@@ -140,7 +146,7 @@ impl System {
         };
         known.job.phase() == JobPhase::Pending
             && !self.jobs.iter().any(|other| before(&other))
-            && known.after.iter().all(|id| self.phase(*id) == JobPhase::Over)
+            && known.after.iter().all(|id| self.phase(id) == JobPhase::Over)
     }
 
     /// A state change of a job by the system itself.
@@ -160,7 +166,7 @@ impl System {
         };
     }
 
-    fn shown(&self) -> Vec<SlurmJob> {
+    fn shown(&self) -> Vec<CampaignJob> {
         self.jobs.iter().map(|known| known.job.clone()).collect()
     }
 
@@ -192,7 +198,7 @@ impl Launcher {
     fn step(&mut self, system: &mut System) {
         let Some(wanted) = self.wanted else { return };
         if let Some(id) = self.plan.cancel.pop() {
-            system.cancel(id);
+            system.cancel(&id);
         } else if !self.plan.submit.is_empty() {
             system.submit(&wanted, self.plan.submit.remove(0));
         }

@@ -1,0 +1,14 @@
+//! A batch system that a configuration describes by its commands.
+
+mod client;
+mod error;
+mod request;
+mod settings;
+mod template;
+#[cfg(test)]
+mod tests;
+
+pub use client::{CustomClient, PolledState};
+pub use error::CustomError;
+pub use request::JobRequest;
+pub use settings::{CustomScheduler, LogTexts, StateWords};
