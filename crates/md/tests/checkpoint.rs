@@ -22,7 +22,9 @@ fn start(thermostat: Thermostat, periodic: [bool; 3], skin: f64) -> (Dynamics, L
     let state = State::thermal(structure, 90.0, &settings.stream);
     let ramp = Some(VolumeRamp::new(&state, 1.0, 1.2, 150));
     let mut potential = LennardJones::argon();
-    let dynamics = Dynamics::new(state, DynamicsSettings { ramp, ..settings }, &mut potential).unwrap();
+    let dynamics =
+        Dynamics::new(state, DynamicsSettings { cell_motion: ramp.into(), ..settings }, &mut potential)
+            .unwrap();
     (dynamics, potential)
 }
 
@@ -69,6 +71,11 @@ fn a_new_segment_takes_other_random_numbers() {
     assert_ne!(first.structure().positions, second.structure().positions);
 }
 
+/// A ramp to a negative volume.
+fn endless_collapse(checkpoint: &Checkpoint) -> VolumeRamp {
+    VolumeRamp::new(&checkpoint.state, 1.0, -1.0, 10)
+}
+
 #[test]
 fn broken_checkpoints_are_refused() {
     let (dynamics, _) = start(thermostats()[2].clone(), [true; 3], 0.6);
@@ -83,7 +90,7 @@ fn broken_checkpoints_are_refused() {
     assert_eq!(refused(|c| c.evaluation.atomic_energies.push(0.0)), length("atomic energies", 33));
     assert_eq!(refused(|c| c.time_step = 0.0), DynamicsError::TimeStep(0.0));
     assert!(matches!(refused(|c| c.state.structure.positions[3][0] = f64::NAN), DynamicsError::Structure(_)));
-    assert!(matches!(refused(|c| c.ramp.as_mut().unwrap().to = -1.0), DynamicsError::Ramp { .. }));
+    assert!(matches!(refused(|c| c.cell_motion = endless_collapse(c).into()), DynamicsError::Ramp { .. }));
     for thermostat in [
         Thermostat::NoseHooverChain(NoseHooverChain::new(90.0, 100.0, 0)),
         Thermostat::NoseHooverChain(NoseHooverChain::new(0.0, 100.0, 3)),

@@ -74,7 +74,7 @@ fn reversed_velocities_lead_back() {
 fn expansion_changes_the_energy_by_the_work_of_the_virial() {
     let (start, mut potential) = warm_argon(2, 20.0, settings(1.0, Thermostat::None), 300);
     let mut checkpoint = start.checkpoint().clone();
-    checkpoint.ramp = Some(VolumeRamp::new(&checkpoint.state, 1.0, 1.05, 1000));
+    checkpoint.cell_motion = VolumeRamp::new(&checkpoint.state, 1.0, 1.05, 1000).into();
     let mut dynamics = Dynamics::resume(checkpoint, 7.0, 0.6).unwrap();
     let trace = |d: &Dynamics| (0..3).map(|k| d.evaluation().virial[k][k]).sum::<f64>();
     let before = dynamics.conserved_energy().unwrap();

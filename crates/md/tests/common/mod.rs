@@ -1,6 +1,6 @@
 //! Two analytically tractable potentials, and statistics of time series.
 use atoms::{Cell, Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, Vec3};
-use md::{Dynamics, DynamicsSettings, State, Stream, Thermostat};
+use md::{CellMotion, Dynamics, DynamicsSettings, State, Stream, Thermostat};
 
 /// Lennard-Jones for argon, 4ε((σ/r)¹² − (σ/r)⁶) (1 − r²/c²)³: smooth to the second derivative at c.
 pub struct LennardJones {
@@ -120,7 +120,13 @@ pub fn argon_crystal(n: usize) -> Structure {
 }
 
 pub fn settings(time_step: f64, thermostat: Thermostat) -> DynamicsSettings {
-    DynamicsSettings { time_step, thermostat, ramp: None, stream: Stream::new(2024, 1, 0), skin: 0.6 }
+    DynamicsSettings {
+        time_step,
+        thermostat,
+        cell_motion: CellMotion::Fixed,
+        stream: Stream::new(2024, 1, 0),
+        skin: 0.6,
+    }
 }
 
 /// Argon at `temperature` after `steps` steps away from the perfect crystal.
