@@ -15,8 +15,8 @@ const MAX_STEPS: usize = 1000;
 /// Replaces the periodic lattice vectors of a skew cell by short ones of the same lattice; returns whether it did.
 ///
 /// The new vectors are integer combinations of the old ones (Semaev, Lect. Notes Comput. Sci. 2146, 181 (2001)), with the
-/// same volume and handedness. Positions are not wrapped, so they stay as they are, and so do all distances, forces and
-/// the strain rate.
+/// same volume and handedness, so all distances, forces and the strain rate stay. Atoms are wrapped into the new cell:
+/// in a cell that flows, as that of a liquid does, images that are far apart move apart without limit.
 pub(crate) fn reduce_if_skew(structure: &mut Structure) -> bool {
     if !is_skew(structure) {
         return false;
@@ -31,7 +31,19 @@ pub(crate) fn reduce_if_skew(structure: &mut Structure) -> bool {
         }
     }
     periodic.iter().zip(vectors).for_each(|(k, vector)| rows[*k] = vector);
+    wrap(structure);
     true
+}
+
+/// Moves each atom by lattice vectors into the cell.
+fn wrap(structure: &mut Structure) {
+    let lattice = structure.cell.completed(structure.periodic);
+    let reciprocal = lattice.reciprocal();
+    for position in &mut structure.positions {
+        let image =
+            |k: usize| if structure.periodic[k] { dot(reciprocal[k], *position).floor() } else { 0.0 };
+        *position = sub(*position, lattice.cartesian(std::array::from_fn(image)));
+    }
 }
 
 fn is_skew(structure: &Structure) -> bool {
@@ -70,7 +82,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn structure(cell: Cell, periodic: [bool; 3]) -> Structure {
-        Structure { species: vec!["Al".parse().unwrap()], positions: vec![[0.0; 3]], cell, periodic }
+        Structure { species: vec!["Al".parse().unwrap()], positions: vec![[7.0, -8.0, 9.0]], cell, periodic }
     }
 
     /// `rows` times integer shears.
@@ -101,7 +113,11 @@ mod tests {
                     prop_assert!((coefficient - coefficient.round()).abs() < 1e-7);
                 }
             }
+            let moved = Cell(rows).fractional(sub([7.0, -8.0, 9.0], reduced.positions[0]));
+            prop_assert!(moved.iter().all(|x| (x - x.round()).abs() < 1e-7));
             if was_skew {
+                let inside = reduced.cell.fractional(reduced.positions[0]);
+                prop_assert!(inside.iter().all(|x| (-1e-9..1.0 + 1e-9).contains(x)));
                 let product: f64 = reduced.cell.0.iter().map(|a| norm(*a)).product();
                 prop_assert!(product <= 2_f64.sqrt() * volume * (1.0 + 1e-8));
             }

@@ -1,6 +1,7 @@
-//! Two analytically tractable potentials, and statistics of time series.
+//! Analytically tractable potentials, crystals, and statistics of time series.
 use atoms::{Cell, Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, Vec3};
-use md::{CellMotion, Dynamics, DynamicsSettings, State, Stream, Thermostat};
+use md::{BarostatSettings, CellMotion, Dynamics, DynamicsSettings, State, Stream, Thermostat};
+use potentials::Eam;
 
 /// Lennard-Jones for argon, 4ε((σ/r)¹² − (σ/r)⁶) (1 − r²/c²)³: smooth to the second derivative at c.
 pub struct LennardJones {
@@ -101,9 +102,47 @@ impl Potential for Springs {
     }
 }
 
+/// Atoms without interaction.
+pub struct IdealGas([Species; 1]);
+
+impl IdealGas {
+    pub fn argon() -> Self {
+        Self(["Ar".parse().unwrap()])
+    }
+}
+
+impl Potential for IdealGas {
+    fn cutoff(&self) -> f64 {
+        0.1
+    }
+
+    fn species(&self) -> &[Species] {
+        &self.0
+    }
+
+    fn evaluate(
+        &mut self,
+        structure: &Structure,
+        _: &NeighbourList,
+        out: &mut Evaluation,
+    ) -> Result<(), PotentialError> {
+        out.reset(structure.len());
+        Ok(())
+    }
+}
+
+/// The embedded-atom potential of aluminium in `configs/data`.
+pub fn aluminium() -> Eam {
+    Eam::load(concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/data/Al_mm.eam.fs")).unwrap()
+}
+
 /// Face-centred cubic argon of n³ cubic cells.
 pub fn argon_crystal(n: usize) -> Structure {
-    let a = 5.4;
+    crystal("Ar", 5.4, n)
+}
+
+/// A face-centred cubic crystal of n³ cubic cells with the lattice constant `a`, Å.
+pub fn crystal(element: &str, a: f64, n: usize) -> Structure {
     let basis = [[0.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.5, 0.0, 0.5], [0.0, 0.5, 0.5]];
     let mut positions = Vec::new();
     for cell in 0..n * n * n {
@@ -112,7 +151,7 @@ pub fn argon_crystal(n: usize) -> Structure {
     }
     let edge = a * n as f64;
     Structure {
-        species: vec!["Ar".parse().unwrap(); positions.len()],
+        species: vec![element.parse().unwrap(); positions.len()],
         positions,
         cell: Cell::orthorhombic(edge, edge, edge),
         periodic: [true; 3],
@@ -127,6 +166,17 @@ pub fn settings(time_step: f64, thermostat: Thermostat) -> DynamicsSettings {
         stream: Stream::new(2024, 1, 0),
         skin: 0.6,
     }
+}
+
+/// These settings with a barostat for `structure`.
+pub fn with_barostat(
+    settings: DynamicsSettings,
+    barostat: &BarostatSettings,
+    temperature: f64,
+    structure: &Structure,
+) -> DynamicsSettings {
+    let cell_motion = barostat.start(temperature, &settings.thermostat, structure).into();
+    DynamicsSettings { cell_motion, ..settings }
 }
 
 /// Argon at `temperature` after `steps` steps away from the perfect crystal.
