@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::cell_freedom::{CellFreedom, CellSpace};
 use crate::error::DynamicsError;
+use crate::lattice_reduction::is_skew;
 use crate::nose_hoover::NoseHooverChain;
 use crate::random::{Stream, StreamId};
 use crate::state::kinetic_tensor;
@@ -279,6 +280,11 @@ impl Barostat {
         if acts && structure.periodic != [true; 3] {
             return Some("a slab or wire has no volume on which a pressure could act: it must be 0");
         }
+        if self.freedom == CellFreedom::FixedAngles && is_skew(structure) {
+            return Some(
+                "the lattice vectors are too skew to be stretched at fixed angles: give shorter ones",
+            );
+        }
         if self
             .volume_range
             .is_some_and(|[least, most]| !(is_positive(least) && least < most && most.is_finite()))
@@ -302,5 +308,83 @@ impl Barostat {
         let d = space.dimensions() as f64;
         let freedom = atoms_degrees_of_freedom as f64 + d;
         freedom * BOLTZMANN * self.temperature * self.damping_time * self.damping_time / d
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::barostat_settings::BarostatSettings;
+
+    #[test]
+    fn reflection_turns_the_isotropic_rate_alone() {
+        let mut structure = Structure {
+            species: vec!["Al".parse().unwrap(); 2],
+            positions: vec![[0.0; 3], [1.0, 2.0, 3.0]],
+            cell: Cell([[4.0, 0.3, 0.0], [0.0, 5.0, 0.2], [0.1, 0.0, 6.0]]),
+            periodic: [true; 3],
+        };
+        let mut barostat = BarostatSettings::default().start(300.0, &Thermostat::None, &structure);
+        let volume = structure.cell.volume();
+        barostat.volume_range = Some([0.75 * volume, 1.3 * volume]);
+        let rate = [[3e-4, 1e-4, -2e-4], [1e-4, -1e-4, 5e-5], [-2e-4, 5e-5, 4e-4]];
+        for (ratio, sign, boundary) in
+            [(1.31, 1.0, 1.3), (1.31, -1.0, 1.3), (0.7, -1.0, 0.75), (0.7, 1.0, 0.75)]
+        {
+            let (mut cell, reflections) = (structure.clone(), barostat.reflections);
+            scale_volume(&mut cell, ratio);
+            barostat.strain_rate = rate.map(|row| row.map(|x| sign * x));
+            let before = barostat.strain_rate;
+            barostat.limit_volume(&mut cell, 7).unwrap();
+            assert!((cell.cell.volume() / volume - boundary).abs() < 1e-12);
+            assert_eq!(barostat.reflections, reflections + 1);
+            let outward = sign * (ratio - 1.0) > 0.0;
+            let turned =
+                combined(&before, &IDENTITY, |v, one| v - if outward { sign * 4e-4 * one } else { 0.0 });
+            let error = combined(&barostat.strain_rate, &turned, |a, b| (a - b).abs());
+            assert!(error.iter().flatten().all(|x| *x < 1e-18), "{error:?}");
+        }
+        scale_volume(&mut structure, 1.2);
+        let before = (structure.clone(), barostat.clone());
+        barostat.limit_volume(&mut structure, 7).unwrap();
+        assert_eq!(before, (structure, barostat));
+    }
+
+    /// Each motion has the mean energy k_B T / 2 under the random force alone.
+    #[test]
+    fn random_force_gives_each_motion_its_thermal_energy() {
+        for freedom in [CellFreedom::Flexible, CellFreedom::Isotropic, CellFreedom::FixedAngles] {
+            for periodic in [[true; 3], [true, true, false], [false, false, true]] {
+                let structure = Structure {
+                    species: vec!["Al".parse().unwrap(); 2],
+                    positions: vec![[0.0; 3], [1.0, 2.0, 3.0]],
+                    cell: Cell([[4.0, 2.3, 0.0], [0.0, 5.0, 0.2], [0.1, 0.0, 6.0]]),
+                    periodic,
+                };
+                let settings =
+                    BarostatSettings { cell: freedom, relaxation_time: 10.0, ..Default::default() };
+                let mut barostat = settings.start(300.0, &Thermostat::None, &structure);
+                barostat.thermostat = CellThermostat::Langevin;
+                let (masses, stream) = ([27.0; 2], Stream::new(5, 0, 0));
+                let atoms = Atoms { masses: &masses, degrees_of_freedom: 3 };
+                let energies = (0..20_000).map(|step| {
+                    // 50 fs: nearly independent samples.
+                    barostat.exchange(&structure, &atoms, 50.0, &stream, step);
+                    barostat.kinetic_energy(&structure, 3)
+                });
+                let mean = energies.sum::<f64>() / 20_000.0;
+                let motions = barostat.degrees_of_freedom(&structure) as f64;
+                let expected = 0.5 * motions * BOLTZMANN * 300.0;
+                let error = expected * (2.0 / motions / 20_000.0_f64).sqrt();
+                assert!(
+                    (mean - expected).abs() < 5.0 * error,
+                    "{freedom:?} {periodic:?}: {mean} eV of {expected} eV"
+                );
+                assert!(
+                    (barostat.heat - barostat.kinetic_energy(&structure, 3)).abs()
+                        < 1e-9 * expected * 20_000.0
+                );
+            }
+        }
     }
 }

@@ -46,7 +46,8 @@ fn wrap(structure: &mut Structure) {
     }
 }
 
-fn is_skew(structure: &Structure) -> bool {
+/// Whether the volume is less than half of the product of the lattice vectors' lengths.
+pub(crate) fn is_skew(structure: &Structure) -> bool {
     let lattice = structure.cell.completed(structure.periodic);
     lattice.volume() < SKEW * lattice.0.iter().map(|a| norm(*a)).product::<f64>()
 }

@@ -40,7 +40,6 @@ fn is_second_order(settings: DynamicsSettings, accuracy: f64) {
     let [coarse, middle, fine] = [8.0, 4.0, 2.0].map(|dt| fluctuation(dynamics.checkpoint(), dt));
     let kinetic = dynamics.kinetic_energy();
     assert!(fine < accuracy * kinetic, "fluctuation {fine} eV of {kinetic} eV");
-    println!("{coarse} {middle} {fine} {kinetic}");
     for ratio in [coarse / middle, middle / fine] {
         assert!((ratio - 4.0).abs() < 0.4, "halving the time step divides the error by {ratio}");
     }

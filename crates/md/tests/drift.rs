@@ -40,6 +40,5 @@ fn conserved_quantities_do_not_drift() {
             "{slope} ± {error} eV per atom and ps, {:?}",
             settings.cell_motion
         );
-        println!("{slope} ± {error}");
     }
 }

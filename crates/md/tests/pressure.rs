@@ -7,7 +7,7 @@ use md::{
 };
 
 use crate::common::{
-    IdealGas, argon_crystal, crystal, mean_and_variance, settings, warm_argon, with_barostat,
+    IdealGas, argon_crystal, crystal, log_odds_slope, mean_and_variance, settings, warm_argon, with_barostat,
 };
 
 fn within_five_errors(what: &str, [found, error]: [f64; 2], expected: f64, scale: f64) {
@@ -84,7 +84,7 @@ fn argon_under_stress(temperature: f64, thermostat: Thermostat, barostat: Barost
     let settings = with_barostat(settings(4.0, thermostat), &barostat, temperature, &argon_crystal(2));
     let (mut dynamics, mut potential) = warm_argon(2, temperature, settings, 4000);
     let mut series = vec![Vec::new(); 8];
-    for _ in 0..60_000 {
+    for _ in 0..30_000 {
         dynamics.step(&mut potential).unwrap();
         let p = dynamics.pressure_tensor().unwrap().map(|row| row.map(|x| x * BAR_PER_EV_A3));
         let cell = dynamics.barostat().unwrap();
@@ -98,12 +98,12 @@ fn argon_under_stress(temperature: f64, thermostat: Thermostat, barostat: Barost
     if barostat.cell == CellFreedom::Flexible {
         for k in 0..6 {
             let expected = if k < 3 { pressure - stress[k] } else { -stress[k] };
-            within_five_errors("component of the pressure", tensor(k), expected, 20.0);
+            within_five_errors("component of the pressure", tensor(k), expected, 30.0);
         }
     }
     let trace: Vec<f64> = (0..series[0].len()).map(|t| (0..3).map(|k| series[k][t] / 3.0).sum()).collect();
     let hydrostatic = pressure - (stress[0] + stress[1] + stress[2]) / 3.0;
-    within_five_errors("pressure", mean_and_variance(&trace, 50).0, hydrostatic, 15.0);
+    within_five_errors("pressure", mean_and_variance(&trace, 50).0, hydrostatic, 20.0);
     let thermal = BOLTZMANN * temperature;
     let cell_freedom = dynamics.barostat().unwrap().degrees_of_freedom(dynamics.structure()) as f64;
     for (what, series, freedom) in
@@ -154,5 +154,38 @@ fn a_liquid_keeps_the_pressure() {
 fn cells_of_one_shape_keep_the_pressure() {
     for cell in [CellFreedom::Isotropic, CellFreedom::FixedAngles] {
         argon_under_stress(20.0, rescaling(20.0), BarostatSettings { cell, ..COMPRESSED });
+    }
+}
+
+/// The histograms of the volume at two pressures have the ratio ln(p₁/p₂) = β (P₂ − P₁) V + constant, for each kind of
+/// cell and thermostat.
+#[test]
+fn volumes_at_two_pressures_have_the_boltzmann_ratio() {
+    let (temperature, pressures) = (20.0, [100.0, 250.0]);
+    let cases = [
+        (chain as fn(f64) -> Thermostat, CellFreedom::Flexible),
+        (rescaling, CellFreedom::Isotropic),
+        (langevin, CellFreedom::FixedAngles),
+    ];
+    for (thermostat, cell) in cases {
+        let [first, second] = pressures.map(|pressure| {
+            let barostat = BarostatSettings { pressure, cell, ..COMPRESSED };
+            let settings = with_barostat(
+                settings(4.0, thermostat(temperature)),
+                &barostat,
+                temperature,
+                &argon_crystal(2),
+            );
+            let (mut dynamics, mut potential) = warm_argon(2, temperature, settings, 2000);
+            let volumes = (0..20_000).map(|_| {
+                dynamics.step(&mut potential).unwrap();
+                dynamics.structure().cell.volume()
+            });
+            volumes.collect::<Vec<f64>>()
+        });
+        let expected = (pressures[1] - pressures[0]) / BAR_PER_EV_A3 / (BOLTZMANN * temperature);
+        let [slope, error] = log_odds_slope(&first, &second, 20);
+        assert!(error < 0.15 * expected, "{slope} ± {error} 1/Å³");
+        assert!((slope - expected).abs() < 5.0 * error, "{slope} ± {error} 1/Å³, expected {expected}");
     }
 }

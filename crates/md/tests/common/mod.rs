@@ -213,3 +213,40 @@ fn block_average(series: &[f64], blocks: usize) -> (f64, f64) {
     let scatter = means.iter().map(|m| (m - mean).powi(2)).sum::<f64>() / (blocks - 1) as f64;
     (mean, (scatter / blocks as f64).sqrt())
 }
+
+/// The slope a of ln(p₁/p₂) = a x + b for samples of two distributions, by maximum likelihood, with its standard error
+/// from blocks, each left out once.
+pub fn log_odds_slope(first: &[f64], second: &[f64], blocks: usize) -> [f64; 2] {
+    let slope = logistic_slope(first, second);
+    let without = |series: &[f64], block: usize| -> Vec<f64> {
+        let length = series.len() / blocks;
+        let kept = |k: &usize| k / length != block;
+        (0..series.len()).filter(kept).map(|k| series[k]).collect()
+    };
+    let slopes = (0..blocks).map(|block| logistic_slope(&without(first, block), &without(second, block)));
+    let variance = slopes.map(|s| (s - slope).powi(2)).sum::<f64>() * (blocks - 1) as f64 / blocks as f64;
+    [slope, variance.sqrt()]
+}
+
+/// Newton's method for the logistic regression of the origin of each sample.
+fn logistic_slope(first: &[f64], second: &[f64]) -> f64 {
+    let all = || first.iter().map(|x| (*x, 1.0)).chain(second.iter().map(|x| (*x, 0.0)));
+    let count = (first.len() + second.len()) as f64;
+    let mean = all().map(|(x, _)| x).sum::<f64>() / count;
+    let width = (all().map(|(x, _)| (x - mean).powi(2)).sum::<f64>() / count).sqrt();
+    let (mut a, mut b) = (0.0, 0.0);
+    for _ in 0..20 {
+        let (mut gradient, mut hessian) = ([0.0; 2], [0.0; 3]);
+        for (x, is_first) in all() {
+            let x = (x - mean) / width;
+            let p = 1.0 / (1.0 + f64::exp(-(a * x + b)));
+            let (miss, weight) = (is_first - p, p * (1.0 - p));
+            gradient = [gradient[0] + miss * x, gradient[1] + miss];
+            hessian = [hessian[0] + weight * x * x, hessian[1] + weight * x, hessian[2] + weight];
+        }
+        let determinant = hessian[0] * hessian[2] - hessian[1] * hessian[1];
+        a += (hessian[2] * gradient[0] - hessian[1] * gradient[1]) / determinant;
+        b += (hessian[0] * gradient[1] - hessian[1] * gradient[0]) / determinant;
+    }
+    a / width
+}
