@@ -102,10 +102,9 @@ fn rotate(a: &mut Matrix3, vectors: &mut Matrix3, p: usize, q: usize) {
     let (rp, rq) = (a[r][p], a[r][q]);
     (a[r][p], a[r][q]) = (c * rp - s * rq, s * rp + c * rq);
     (a[p][r], a[q][r]) = (a[r][p], a[r][q]);
-    for k in 0..3 {
-        let (x, y) = (vectors[p][k], vectors[q][k]);
-        (vectors[p][k], vectors[q][k]) = (c * x - s * y, s * x + c * y);
-    }
+    let (x, y) = (vectors[p], vectors[q]);
+    vectors[p] = cell::sub(cell::scale(x, c), cell::scale(y, s));
+    vectors[q] = cell::add(cell::scale(x, s), cell::scale(y, c));
 }
 
 #[cfg(test)]

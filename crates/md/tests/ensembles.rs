@@ -58,7 +58,7 @@ fn energies_at_two_temperatures_have_the_boltzmann_ratio() {
         let [first, second] = [cold, hot].map(|temperature| {
             let settings = settings(4.0, thermostat(temperature));
             let (mut dynamics, mut potential) = warm_argon(2, temperature, settings, 1000);
-            let energies = (0..20_000).map(|_| {
+            let energies = (0..12_000).map(|_| {
                 dynamics.step(&mut potential).unwrap();
                 dynamics.evaluation().energy()
             });

@@ -96,8 +96,8 @@ fn argon_under_stress(temperature: f64, thermostat: Thermostat, barostat: Barost
     let (pressure, stress) = (barostat.pressure, barostat.stress);
     let tensor = |k: usize| mean_and_variance(&series[k], 50).0;
     if barostat.cell == CellFreedom::Flexible {
-        for k in 0..6 {
-            let expected = if k < 3 { pressure - stress[k] } else { -stress[k] };
+        for (k, stress) in stress.iter().enumerate() {
+            let expected = if k < 3 { pressure - stress } else { -stress };
             within_five_errors("component of the pressure", tensor(k), expected, 30.0);
         }
     }
@@ -177,7 +177,7 @@ fn volumes_at_two_pressures_have_the_boltzmann_ratio() {
                 &argon_crystal(2),
             );
             let (mut dynamics, mut potential) = warm_argon(2, temperature, settings, 2000);
-            let volumes = (0..20_000).map(|_| {
+            let volumes = (0..12_000).map(|_| {
                 dynamics.step(&mut potential).unwrap();
                 dynamics.structure().cell.volume()
             });
@@ -188,4 +188,46 @@ fn volumes_at_two_pressures_have_the_boltzmann_ratio() {
         assert!(error < 0.15 * expected, "{slope} ± {error} 1/Å³");
         assert!((slope - expected).abs() < 5.0 * error, "{slope} ± {error} 1/Å³, expected {expected}");
     }
+}
+
+/// The isothermal bulk modulus from the fluctuations of the volume, k_B T ⟨V⟩ / ⟨(V − ⟨V⟩)²⟩, is that of the mean
+/// pressure at constant volume, −V d⟨P⟩/dV.
+#[test]
+fn fluctuations_of_the_volume_give_the_bulk_modulus() {
+    let temperature = 20.0;
+    let barostat = BarostatSettings { cell: CellFreedom::Isotropic, relaxation_time: 100.0, ..COMPRESSED };
+    let fixed = settings(4.0, rescaling(temperature));
+    let moving = with_barostat(fixed.clone(), &barostat, temperature, &argon_crystal(2));
+    let (mut dynamics, mut potential) = warm_argon(2, temperature, moving, 4000);
+    let volumes: Vec<f64> = (0..40_000)
+        .map(|_| {
+            dynamics.step(&mut potential).unwrap();
+            dynamics.structure().cell.volume()
+        })
+        .collect();
+    let ([volume, _], [variance, error]) = mean_and_variance(&volumes, 50);
+    let from_fluctuations = BOLTZMANN * temperature * volume / variance;
+    let error = from_fluctuations * error / variance;
+
+    let pressures = [0.98, 1.02].map(|ratio| {
+        let mut state = dynamics.state().clone();
+        let present = state.structure.cell.volume();
+        md::scale_volume(&mut state.structure, ratio * volume / present);
+        let mut dynamics = Dynamics::new(state, fixed.clone(), &mut potential).unwrap();
+        let series: Vec<f64> = (0..10_000)
+            .map(|_| {
+                dynamics.step(&mut potential).unwrap();
+                let tensor = dynamics.pressure_tensor().unwrap();
+                (tensor[0][0] + tensor[1][1] + tensor[2][2]) / 3.0
+            })
+            .collect();
+        mean_and_variance(&series[1000..], 20).0
+    });
+    let slope = (pressures[0][0] - pressures[1][0]) / 0.04;
+    let error = error.hypot(pressures[0][1].hypot(pressures[1][1]) / 0.04);
+    assert!(error < 0.1 * slope, "{from_fluctuations} ± {error} eV/Å³");
+    assert!(
+        (from_fluctuations - slope).abs() < 5.0 * error,
+        "{from_fluctuations} ± {error} eV/Å³, from the pressure {slope}"
+    );
 }
