@@ -4,7 +4,7 @@
 //!
 //! Writes the initial positions and velocities of 108 atoms to START and, every EVERY steps of 2 fs, a line to SERIES:
 //! step, potential energy per atom (eV), volume (Å³), temperature (K), pressure (bar), lengths of the lattice vectors (Å).
-//! THERMOSTAT is `chain`, `rescaling` or `langevin`. The crystal is stretched by the factor STRETCH along z.
+//! THERMOSTAT is `chain`, `rescaling`, `langevin` or `none` (constant enthalpy). The crystal is stretched by the factor STRETCH along z.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -59,7 +59,8 @@ fn begin(
             ThermostatSettings::VelocityRescaling(VelocityRescalingSettings { relaxation_time: 100.0 })
         }
         "langevin" => ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 }),
-        other => return Err(format!("thermostat {other}: chain, rescaling or langevin").into()),
+        "none" => ThermostatSettings::None {},
+        other => return Err(format!("thermostat {other}: chain, rescaling, langevin or none").into()),
     };
     let stream = Stream::new(24, 0, 0);
     // Half of the kinetic energy becomes potential energy.
