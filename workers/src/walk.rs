@@ -275,8 +275,12 @@ impl<'a> RunningWalk<'a> {
     }
 
     fn relative_volume(&self) -> f64 {
-        let ramp =
-            self.dynamics.checkpoint().ramp.filter(|_| self.dynamics.structure().periodic != [false; 3]);
+        let ramp = self
+            .dynamics
+            .checkpoint()
+            .cell_motion
+            .ramp()
+            .filter(|_| self.dynamics.structure().periodic != [false; 3]);
         ramp.map_or(1.0, |ramp| ramp.relative_volume(self.step()))
     }
 

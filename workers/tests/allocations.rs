@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use atoms::{Structure, read_extxyz};
 use calm::Artifact;
-use md::{Dynamics, DynamicsSettings, Langevin, State, Stream, Thermostat};
+use md::{CellMotion, Dynamics, DynamicsSettings, Langevin, State, Stream, Thermostat};
 use potentials::grace::{Grace, GraceModel, Precision, RadialPath};
 use potentials::{Zbl, ZblWindow, ZblWindows};
 use workers::bias::BiasedPotential;
@@ -73,7 +73,7 @@ fn check(precision: Precision) {
     let settings = DynamicsSettings {
         time_step: 1.0,
         thermostat: Thermostat::Langevin(Langevin { temperature: 50.0, friction: 0.01 }),
-        ramp: None,
+        cell_motion: CellMotion::Fixed,
         stream,
         // At 50 K no atom moves by half the skin in a few steps, so the list is not rebuilt.
         skin: 1.0,

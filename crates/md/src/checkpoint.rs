@@ -3,11 +3,11 @@
 use atoms::Evaluation;
 use serde::{Deserialize, Serialize};
 
+use crate::cell_motion::CellMotion;
 use crate::error::DynamicsError;
 use crate::random::Stream;
 use crate::state::State;
 use crate::thermostat::Thermostat;
-use crate::volume_ramp::VolumeRamp;
 
 /// A run between two steps.
 ///
@@ -21,8 +21,8 @@ pub struct Checkpoint {
     pub evaluation: Evaluation,
     /// The thermostat with its dynamical variables.
     pub thermostat: Thermostat,
-    /// The volume ramp, if any.
-    pub ramp: Option<VolumeRamp>,
+    /// How the cell moves, with its dynamical variables.
+    pub cell_motion: CellMotion,
     /// fs.
     pub time_step: f64,
     /// The random stream. A walk that rolls back to this checkpoint gets a new segment.
@@ -52,9 +52,15 @@ impl Checkpoint {
         if let Some(fault) = self.thermostat.invalid_setting(n) {
             return Err(DynamicsError::Thermostat(fault));
         }
-        match self.ramp {
-            Some(ramp) if !ramp.is_valid() => Err(DynamicsError::Ramp { from: ramp.from, to: ramp.to }),
-            _ => Ok(()),
+        match &self.cell_motion {
+            CellMotion::VolumeRamp(ramp) if !ramp.is_valid() => {
+                Err(DynamicsError::Ramp { from: ramp.from, to: ramp.to })
+            }
+            CellMotion::Barostat(barostat) => {
+                let fault = barostat.invalid_setting(&self.thermostat, &self.state.structure);
+                fault.map_or(Ok(()), |fault| Err(DynamicsError::Barostat(fault)))
+            }
+            CellMotion::Fixed | CellMotion::VolumeRamp(_) => Ok(()),
         }
     }
 }

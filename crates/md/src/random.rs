@@ -11,6 +11,10 @@ pub enum StreamId {
     InitialVelocities = 0,
     /// The random force of the Langevin thermostat.
     Langevin = 1,
+    /// Stochastic velocity rescaling.
+    VelocityRescaling = 2,
+    /// The random force on the cell.
+    Cell = 3,
 }
 
 /// The random stream of one segment of a walk.

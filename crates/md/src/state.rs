@@ -2,7 +2,7 @@
 
 use atoms::cell::{add, dot, scale, sub};
 use atoms::units::{ACCELERATION, BOLTZMANN};
-use atoms::{Species, Structure, Vec3};
+use atoms::{Matrix3, Species, Structure, Vec3};
 use serde::{Deserialize, Serialize};
 
 use crate::random::{Stream, StreamId};
@@ -34,6 +34,17 @@ pub fn masses(species: &[Species]) -> Vec<f64> {
 /// K = ½ Σ m v², eV. `velocities` in Å/fs, `masses` in u.
 pub fn kinetic_energy(velocities: &[Vec3], masses: &[f64]) -> f64 {
     velocities.iter().zip(masses).map(|(v, m)| m * dot(*v, *v)).sum::<f64>() / (2.0 * ACCELERATION)
+}
+
+/// Σ m vᵀ v, eV. `velocities` in Å/fs, `masses` in u.
+pub fn kinetic_tensor(velocities: &[Vec3], masses: &[f64]) -> Matrix3 {
+    let mut sum = [[0.0; 3]; 3];
+    for (v, mass) in velocities.iter().zip(masses) {
+        for (row, x) in sum.iter_mut().zip(v) {
+            *row = add(*row, scale(*v, mass * x));
+        }
+    }
+    sum.map(|row| row.map(|x| x / ACCELERATION))
 }
 
 /// P = Σ m v, u Å/fs.

@@ -8,6 +8,7 @@ use crate::langevin::{Langevin, LangevinSettings};
 use crate::nose_hoover::{NoseHooverChain, NoseHooverSettings};
 use crate::random::Stream;
 use crate::state;
+use crate::velocity_rescaling::{VelocityRescaling, VelocityRescalingSettings};
 use crate::wrong_setting::WrongSetting;
 
 /// A thermostat as a configuration names it.
@@ -18,6 +19,8 @@ pub enum ThermostatSettings {
     Langevin(LangevinSettings),
     /// Nosé–Hoover chain.
     NoseHoover(NoseHooverSettings),
+    /// Stochastic velocity rescaling.
+    VelocityRescaling(VelocityRescalingSettings),
     /// Constant energy.
     None {},
 }
@@ -28,6 +31,7 @@ impl ThermostatSettings {
         match self {
             Self::Langevin(settings) => Thermostat::Langevin(settings.start(temperature)),
             Self::NoseHoover(settings) => Thermostat::NoseHooverChain(settings.start(temperature)),
+            Self::VelocityRescaling(settings) => Thermostat::VelocityRescaling(settings.start(temperature)),
             Self::None {} => Thermostat::None,
         }
     }
@@ -37,6 +41,7 @@ impl ThermostatSettings {
         match self {
             Self::Langevin(settings) => settings.wrong(),
             Self::NoseHoover(settings) => settings.wrong(),
+            Self::VelocityRescaling(settings) => settings.wrong(),
             Self::None {} => None,
         }
     }
@@ -52,6 +57,8 @@ pub enum Thermostat {
     Langevin(Langevin),
     /// Deterministic, canonical for ergodic systems.
     NoseHooverChain(NoseHooverChain),
+    /// One random factor for all velocities, canonical.
+    VelocityRescaling(VelocityRescaling),
 }
 
 impl Thermostat {
@@ -59,7 +66,7 @@ impl Thermostat {
     pub fn degrees_of_freedom(&self, atoms: usize) -> usize {
         match self {
             Self::Langevin(_) => 3 * atoms,
-            Self::None | Self::NoseHooverChain(_) => 3 * atoms.saturating_sub(1),
+            Self::None | Self::NoseHooverChain(_) | Self::VelocityRescaling(_) => 3 * atoms.saturating_sub(1),
         }
     }
 
@@ -72,7 +79,7 @@ impl Thermostat {
                 let factor = chain.half_step(state::kinetic_energy(velocities, masses), freedom, time_step);
                 velocities.iter_mut().for_each(|v| *v = cell::scale(*v, factor));
             }
-            Self::None | Self::Langevin(_) => {}
+            Self::None | Self::Langevin(_) | Self::VelocityRescaling(_) => {}
         }
     }
 
@@ -87,6 +94,11 @@ impl Thermostat {
     ) {
         match self {
             Self::Langevin(langevin) => langevin.exchange(velocities, masses, time_step, stream, step),
+            Self::VelocityRescaling(rescaling) => {
+                let (kinetic, atoms) = (state::kinetic_energy(velocities, masses), masses.len());
+                let factor = rescaling.factor(kinetic, atoms, time_step, stream, step);
+                velocities.iter_mut().for_each(|v| *v = cell::scale(*v, factor));
+            }
             Self::None | Self::NoseHooverChain(_) => {}
         }
     }
@@ -97,6 +109,7 @@ impl Thermostat {
             Self::None => Some(0.0),
             Self::Langevin(_) => None,
             Self::NoseHooverChain(chain) => Some(chain.energy(degrees_of_freedom)),
+            Self::VelocityRescaling(rescaling) => Some(-rescaling.heat),
         }
     }
 
@@ -106,6 +119,7 @@ impl Thermostat {
             Self::None => None,
             Self::Langevin(langevin) => langevin.invalid_setting(),
             Self::NoseHooverChain(chain) => chain.invalid_setting(atoms),
+            Self::VelocityRescaling(rescaling) => rescaling.invalid_setting(atoms),
         }
     }
 }

@@ -69,7 +69,7 @@ pub fn scale_volume(structure: &mut Structure, ratio: f64) {
 }
 
 /// Volume, area or length of the periodic directions; 1 for a cluster.
-fn extent(structure: &Structure) -> f64 {
+pub(crate) fn extent(structure: &Structure) -> f64 {
     structure.cell.completed(structure.periodic).volume()
 }
 

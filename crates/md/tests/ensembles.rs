@@ -1,9 +1,9 @@
 //! Thermostats against the canonical distribution: mean and width, within five standard errors.
 
 use atoms::units::{ACCELERATION, BOLTZMANN};
-use md::{Dynamics, Langevin, NoseHooverChain, State, Thermostat};
+use md::{Dynamics, Langevin, NoseHooverChain, State, Thermostat, VelocityRescaling};
 
-use crate::common::{Springs, argon_crystal, mean_and_variance, settings, warm_argon};
+use crate::common::{Springs, argon_crystal, log_odds_slope, mean_and_variance, settings, warm_argon};
 
 fn within_five_errors(what: &str, [found, error]: [f64; 2], expected: f64) {
     assert!(error < 0.1 * expected, "{what}: too few samples, {found} ± {error}");
@@ -33,6 +33,42 @@ fn langevin_kinetic_energy_is_canonical() {
 #[test]
 fn nose_hoover_kinetic_energy_is_canonical() {
     kinetic_energy_is_canonical(120.0, Thermostat::NoseHooverChain(NoseHooverChain::new(120.0, 200.0, 3)));
+}
+
+fn rescaling(temperature: f64) -> Thermostat {
+    Thermostat::VelocityRescaling(VelocityRescaling { temperature, relaxation_time: 100.0, heat: 0.0 })
+}
+
+#[test]
+fn velocity_rescaling_kinetic_energy_is_canonical() {
+    kinetic_energy_is_canonical(90.0, rescaling(90.0));
+}
+
+/// The histograms of the potential energy at two temperatures have the ratio of the Boltzmann factors, ln(p₁/p₂) = (β₂ −
+/// β₁) E + constant (Shirts, J. Chem. Theory Comput. 9, 909 (2013)).
+#[test]
+fn energies_at_two_temperatures_have_the_boltzmann_ratio() {
+    let [cold, hot] = [60.0, 66.0];
+    let thermostats: [fn(f64) -> Thermostat; 3] = [
+        |temperature| Thermostat::Langevin(Langevin { temperature, friction: 0.01 }),
+        |temperature| Thermostat::NoseHooverChain(NoseHooverChain::new(temperature, 200.0, 3)),
+        rescaling,
+    ];
+    for thermostat in thermostats {
+        let [first, second] = [cold, hot].map(|temperature| {
+            let settings = settings(4.0, thermostat(temperature));
+            let (mut dynamics, mut potential) = warm_argon(2, temperature, settings, 1000);
+            let energies = (0..12_000).map(|_| {
+                dynamics.step(&mut potential).unwrap();
+                dynamics.evaluation().energy()
+            });
+            energies.collect::<Vec<f64>>()
+        });
+        let expected = (1.0 / hot - 1.0 / cold) / BOLTZMANN;
+        let [slope, error] = log_odds_slope(&first, &second, 20);
+        assert!(error < 0.15 * expected.abs(), "{slope} ± {error} 1/eV");
+        assert!((slope - expected).abs() < 5.0 * error, "{slope} ± {error} 1/eV, expected {expected}");
+    }
 }
 
 /// In a harmonic well BAOAB samples positions exactly at any stable time step, ⟨x²⟩ = k_B T / k, while

@@ -2,7 +2,10 @@
 
 mod common;
 
+mod barostat;
 mod checkpoint;
 mod conservation;
+mod drift;
 mod ensembles;
+mod pressure;
 mod relaxation;

@@ -2,7 +2,6 @@
 
 use std::path::{Path, PathBuf};
 
-use toml::{Table, Value};
 use workers::labeller::BatchSystem;
 
 use super::check::MachineCheck;
@@ -15,6 +14,8 @@ use crate::{disk_forecast, runtime};
 /// A configuration, and what its files and its label method say.
 pub struct Requirements {
     /// The configuration.
+    pub config: Config,
+    /// Whether its labels can be made.
     labels: Result<(), String>,
     /// `None` if the label method is not there, without which a campaign cannot be loaded.
     campaign: Option<Result<LoadedCampaign, String>>,

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use atoms::Potential;
-use md::{Dynamics, DynamicsSettings, State, Stream, default_time_step};
+use md::{CellMotion, Dynamics, DynamicsSettings, State, Stream, default_time_step};
 
 use self::config::{DynamicsSection, MdConfig, OutputSection};
 use self::trajectory::{Trajectory, time};
@@ -90,7 +90,7 @@ fn settings(dynamics: &DynamicsSection, state: &State) -> DynamicsSettings {
     DynamicsSettings {
         time_step: dynamics.time_step.map_or(default, |time_step| time_step.get()),
         thermostat: dynamics.thermostat.start(dynamics.temperature.get()),
-        ramp: None,
+        cell_motion: CellMotion::Fixed,
         stream: Stream::new(dynamics.rng_seed, 0, 0),
         skin: dynamics.skin.get(),
     }

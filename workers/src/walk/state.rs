@@ -89,7 +89,8 @@ pub(super) fn start(
         ramp.apply(&mut start.structure, 0);
     }
     let thermostat = settings.thermostat.start(conditions.temperature);
-    let run = md::DynamicsSettings { time_step, thermostat, ramp, stream, skin: settings.skin };
+    let run =
+        md::DynamicsSettings { time_step, thermostat, cell_motion: ramp.into(), stream, skin: settings.skin };
     let dynamics = Dynamics::new(start, run, potential)?;
     let state = WalkState {
         dynamics: dynamics.checkpoint().clone(),

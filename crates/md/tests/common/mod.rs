@@ -1,6 +1,7 @@
-//! Two analytically tractable potentials, and statistics of time series.
+//! Analytically tractable potentials, crystals, and statistics of time series.
 use atoms::{Cell, Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, Vec3};
-use md::{Dynamics, DynamicsSettings, State, Stream, Thermostat};
+use md::{BarostatSettings, CellMotion, Dynamics, DynamicsSettings, State, Stream, Thermostat};
+use potentials::Eam;
 
 /// Lennard-Jones for argon, 4ε((σ/r)¹² − (σ/r)⁶) (1 − r²/c²)³: smooth to the second derivative at c.
 pub struct LennardJones {
@@ -101,9 +102,47 @@ impl Potential for Springs {
     }
 }
 
+/// Atoms without interaction.
+pub struct IdealGas([Species; 1]);
+
+impl IdealGas {
+    pub fn argon() -> Self {
+        Self(["Ar".parse().unwrap()])
+    }
+}
+
+impl Potential for IdealGas {
+    fn cutoff(&self) -> f64 {
+        0.1
+    }
+
+    fn species(&self) -> &[Species] {
+        &self.0
+    }
+
+    fn evaluate(
+        &mut self,
+        structure: &Structure,
+        _: &NeighbourList,
+        out: &mut Evaluation,
+    ) -> Result<(), PotentialError> {
+        out.reset(structure.len());
+        Ok(())
+    }
+}
+
+/// The embedded-atom potential of aluminium in `configs/data`.
+pub fn aluminium() -> Eam {
+    Eam::load(concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/data/Al_mm.eam.fs")).unwrap()
+}
+
 /// Face-centred cubic argon of n³ cubic cells.
 pub fn argon_crystal(n: usize) -> Structure {
-    let a = 5.4;
+    crystal("Ar", 5.4, n)
+}
+
+/// A face-centred cubic crystal of n³ cubic cells with the lattice constant `a`, Å.
+pub fn crystal(element: &str, a: f64, n: usize) -> Structure {
     let basis = [[0.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.5, 0.0, 0.5], [0.0, 0.5, 0.5]];
     let mut positions = Vec::new();
     for cell in 0..n * n * n {
@@ -112,7 +151,7 @@ pub fn argon_crystal(n: usize) -> Structure {
     }
     let edge = a * n as f64;
     Structure {
-        species: vec!["Ar".parse().unwrap(); positions.len()],
+        species: vec![element.parse().unwrap(); positions.len()],
         positions,
         cell: Cell::orthorhombic(edge, edge, edge),
         periodic: [true; 3],
@@ -120,7 +159,24 @@ pub fn argon_crystal(n: usize) -> Structure {
 }
 
 pub fn settings(time_step: f64, thermostat: Thermostat) -> DynamicsSettings {
-    DynamicsSettings { time_step, thermostat, ramp: None, stream: Stream::new(2024, 1, 0), skin: 0.6 }
+    DynamicsSettings {
+        time_step,
+        thermostat,
+        cell_motion: CellMotion::Fixed,
+        stream: Stream::new(2024, 1, 0),
+        skin: 0.6,
+    }
+}
+
+/// These settings with a barostat for `structure`.
+pub fn with_barostat(
+    settings: DynamicsSettings,
+    barostat: &BarostatSettings,
+    temperature: f64,
+    structure: &Structure,
+) -> DynamicsSettings {
+    let cell_motion = barostat.start(temperature, &settings.thermostat, structure).into();
+    DynamicsSettings { cell_motion, ..settings }
 }
 
 /// Argon at `temperature` after `steps` steps away from the perfect crystal.
@@ -156,4 +212,41 @@ fn block_average(series: &[f64], blocks: usize) -> (f64, f64) {
     let mean = means.iter().sum::<f64>() / blocks as f64;
     let scatter = means.iter().map(|m| (m - mean).powi(2)).sum::<f64>() / (blocks - 1) as f64;
     (mean, (scatter / blocks as f64).sqrt())
+}
+
+/// The slope a of ln(p₁/p₂) = a x + b for samples of two distributions, by maximum likelihood, with its standard error
+/// from blocks, each left out once.
+pub fn log_odds_slope(first: &[f64], second: &[f64], blocks: usize) -> [f64; 2] {
+    let slope = logistic_slope(first, second);
+    let without = |series: &[f64], block: usize| -> Vec<f64> {
+        let length = series.len() / blocks;
+        let kept = |k: &usize| k / length != block;
+        (0..series.len()).filter(kept).map(|k| series[k]).collect()
+    };
+    let slopes = (0..blocks).map(|block| logistic_slope(&without(first, block), &without(second, block)));
+    let variance = slopes.map(|s| (s - slope).powi(2)).sum::<f64>() * (blocks - 1) as f64 / blocks as f64;
+    [slope, variance.sqrt()]
+}
+
+/// Newton's method for the logistic regression of the origin of each sample.
+fn logistic_slope(first: &[f64], second: &[f64]) -> f64 {
+    let all = || first.iter().map(|x| (*x, 1.0)).chain(second.iter().map(|x| (*x, 0.0)));
+    let count = (first.len() + second.len()) as f64;
+    let mean = all().map(|(x, _)| x).sum::<f64>() / count;
+    let width = (all().map(|(x, _)| (x - mean).powi(2)).sum::<f64>() / count).sqrt();
+    let (mut a, mut b) = (0.0, 0.0);
+    for _ in 0..20 {
+        let (mut gradient, mut hessian) = ([0.0; 2], [0.0; 3]);
+        for (x, is_first) in all() {
+            let x = (x - mean) / width;
+            let p = 1.0 / (1.0 + f64::exp(-(a * x + b)));
+            let (miss, weight) = (is_first - p, p * (1.0 - p));
+            gradient = [gradient[0] + miss * x, gradient[1] + miss];
+            hessian = [hessian[0] + weight * x * x, hessian[1] + weight * x, hessian[2] + weight];
+        }
+        let determinant = hessian[0] * hessian[2] - hessian[1] * hessian[1];
+        a += (hessian[2] * gradient[0] - hessian[1] * gradient[1]) / determinant;
+        b += (hessian[0] * gradient[1] - hessian[1] * gradient[0]) / determinant;
+    }
+    a / width
 }

@@ -11,7 +11,7 @@ use std::time::Instant;
 
 use atoms::Potential;
 use case::Case;
-use md::{Dynamics, DynamicsSettings, Stream, Thermostat};
+use md::{CellMotion, Dynamics, DynamicsSettings, Stream, Thermostat};
 use peer::Lammps;
 
 /// Number of measurements per program and crystal.
@@ -91,7 +91,7 @@ impl Ours {
         let settings = DynamicsSettings {
             time_step: case.time_step,
             thermostat: Thermostat::None,
-            ramp: None,
+            cell_motion: CellMotion::Fixed,
             stream: Stream::new(1, 0, 0),
             skin: case::SKIN,
         };
