@@ -100,7 +100,7 @@ impl Campaign {
     fn run(settings: SelectorSettings, walkers: usize, seeds: Vec<SeedStructurePlan>) -> Self {
         let model = Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap());
         let context = WalkContext {
-            model: Arc::clone(&model),
+            model: model.clone(),
             threads: Threads::default(),
             settings: Arc::new(walk_settings()),
         };
@@ -116,7 +116,8 @@ impl Campaign {
                     begun.insert(assignment.walk);
                 }
                 let used = processor_time();
-                let report = advance(&context, &assignment, Arc::clone(selector.mixture()), || false, |_| {});
+                let report =
+                    advance(&context, &assignment, Arc::clone(selector.mixture()), || false, |_| {}).unwrap();
                 let taken = processor_time() - used;
                 work += taken;
                 number += 1;

@@ -3,10 +3,11 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use calm::Projection;
 use calm::baselines::FeatureOrigin;
+use calm::{Artifact, Projection, ProjectionMismatch};
 use potentials::grace::{self, FeatureForm, GraceModel, UnfitProjection};
 
+use crate::artifact_checks::check_belongs_to;
 use crate::exit_status::CommandError;
 use crate::features::FeatureCalculator;
 use crate::loaded_model::LoadedModel;
@@ -119,6 +120,17 @@ impl FeatureModel {
         let same = baselines.check_same(&found.origin(path)?);
         same.map_err(|error| CommandError::Input(format!("{}: {error}", file.display())))?;
         Ok(found)
+    }
+
+    /// Checks that an artifact has the elements and the features of the model.
+    ///
+    /// # Errors
+    /// The first difference.
+    pub fn check_artifact(&self, artifact: &Artifact) -> Result<(), ProjectionMismatch> {
+        match self.is_hidden {
+            true => artifact.check_belongs_to(&self.symbols(), &unchanged(self.dimension())),
+            false => check_belongs_to(artifact, &self.model),
+        }
     }
 
     /// Computes these features on the calling thread.

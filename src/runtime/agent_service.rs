@@ -36,6 +36,12 @@ impl AgentService {
             (run.store.clone().with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT), Arc::clone(mixture));
         let Some(listen) = run.listen else { return Ok(Self { server: None, store, mixture }) };
         let config = &run.campaign.config;
+        if config.potential.python.is_some() {
+            return Err(CommandError::input(
+                "agents on other hosts evaluate exported GRACE models only; expected a campaign without [potential.python], or run without \
+                 --listen",
+            ));
+        }
         let model = run.campaign.model_files()?;
         let files = model.files().map(|file| (file.hash.clone(), file.path.clone())).collect();
         let setup = AgentConfig {

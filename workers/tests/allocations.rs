@@ -67,7 +67,7 @@ fn check(precision: Precision) {
     let zbl =
         Zbl::new(&structure.species, &ZblWindows::Uniform(ZblWindow { inner: 1.6, outer: 2.4 })).unwrap();
     let mut potential =
-        BiasedPotential::new(Grace::new(model), mixture, Some(zbl), 2, &structure.species).unwrap();
+        BiasedPotential::new(Box::new(Grace::new(model)), mixture, Some(zbl), 2, &structure.species).unwrap();
     let stream = Stream::new(3, 0, 0);
     let state = State::thermal(structure, 50.0, &stream);
     let settings = DynamicsSettings {

@@ -58,7 +58,8 @@ fn check(name: &str) {
     let (model, structure) = (model(name), alloy());
     let mixture = mixture(&model, &structure);
     let mut potential =
-        BiasedPotential::new(Grace::new(Arc::clone(&model)), mixture, None, 1, &structure.species).unwrap();
+        BiasedPotential::new(Box::new(Grace::new(Arc::clone(&model))), mixture, None, 1, &structure.species)
+            .unwrap();
     potential.tau = 0.3;
     evaluate(&mut potential, &structure); // the bias is silent at first
     let (_, biased) = evaluate(&mut potential, &structure);

@@ -94,7 +94,7 @@ fn assignment(structure: Structure, until: u64) -> Assignment {
 fn run(settings: &WalkSettings, assignment: &Assignment) -> AssignmentReport<Candidate> {
     let context =
         WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings.clone()) };
-    advance(&context, assignment, mixture(), || false, |_| {})
+    advance(&context, assignment, mixture(), || false, |_| {}).unwrap()
 }
 
 /// The first 150 steps of a walk under these conditions.
@@ -167,7 +167,7 @@ fn damaged_checkpoints_do_not_stop_a_walker() {
     let mut refused = 0;
     for number in 0..mutate::mutations(60) {
         next.checkpoint = Some(mutate::mutated(&checkpoint, number));
-        let go = || advance(&context, &next, Arc::clone(&mixture), || false, |_| {});
+        let go = || advance(&context, &next, Arc::clone(&mixture), || false, |_| {}).unwrap();
         let report = catch_unwind(AssertUnwindSafe(go));
         let report = report.unwrap_or_else(|_| panic!("a panic at mutation {number}"));
         refused += u32::from(matches!(report.outcome, Outcome::Ended(WalkEnd::InvalidStart { .. })));
@@ -183,9 +183,14 @@ fn never() -> CollectionRule {
 fn the_bias_is_the_hal_force() {
     let (model, mixture, structure) = (model(), mixture(), seed_structure("slab-111"));
     let species = &structure.species;
-    let mut biased =
-        BiasedPotential::new(Grace::new(Arc::clone(&model)), Arc::clone(&mixture), None, 10, species)
-            .unwrap();
+    let mut biased = BiasedPotential::new(
+        Box::new(Grace::new(Arc::clone(&model))),
+        Arc::clone(&mixture),
+        None,
+        10,
+        species,
+    )
+    .unwrap();
     biased.tau = 0.3;
     let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
     let (mut force_norm, mut gradient_norm) = (0.0, 0.0);

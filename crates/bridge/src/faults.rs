@@ -47,6 +47,8 @@ pub(crate) struct Reply {
     pub traceback: Option<String>,
     #[serde(default)]
     pub compiled: bool,
+    #[serde(default)]
+    pub seconds: f64,
 }
 
 impl Reply {

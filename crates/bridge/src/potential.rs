@@ -34,7 +34,7 @@ enum Client {
     },
     /// The topology that the service has, if any.
     Shared {
-        calls: CallClient,
+        calls: Box<CallClient>,
         known: Option<Arc<Topology>>,
     },
 }
@@ -136,7 +136,7 @@ impl Client {
             Connection::Shared(address, stopping) => {
                 let calls = CallClient::connect(address, stopping.clone());
                 let calls = calls.map_err(|error| PotentialError::Unavailable(error.to_string()))?;
-                Ok(Self::Shared { calls, known: None })
+                Ok(Self::Shared { calls: Box::new(calls), known: None })
             }
         }
     }

@@ -160,16 +160,16 @@ impl Server {
         Ok(Outstanding { id, kind, slot, sent: now, deadline: now + timeout })
     }
 
-    /// Takes in the answer to the oldest call. Returns whether the shape was new.
+    /// Takes in the answer to the oldest call. Returns whether the shape was new, and the time that the adapter took, s.
     ///
     /// # Errors
     /// What the server reports, or that the line is no answer.
-    pub fn answer(&mut self, line: &str, call: &Outstanding, names: &str) -> Result<bool, Fault> {
+    pub fn answer(&mut self, line: &str, call: &Outstanding, names: &str) -> Result<(bool, f64), Fault> {
         let reply = Reply::read(line, Some(call.id), names)?;
         let evaluates = matches!(call.kind, BatchKind::Evaluate { .. });
         self.arenas[call.slot].unlink();
         let is_new = self.known_shapes.insert((self.arenas[call.slot].shape(), evaluates));
-        Ok(reply.compiled || (is_new && self.description.padding))
+        Ok((reply.compiled || (is_new && self.description.padding), reply.seconds))
     }
 }
 

@@ -349,9 +349,10 @@ impl Running<'_> {
         };
         let Some(server) = &mut self.server else { return };
         match server.answer(line, &call, &names) {
-            Ok(compiled) => {
+            Ok((compiled, seconds)) => {
                 let now = Instant::now();
                 self.schedule.done(now);
+                self.note(|statistics| statistics.computed += seconds);
                 self.count(&call, &batch, compiled, now);
                 self.deliver(&call, &batch);
             }

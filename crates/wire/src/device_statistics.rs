@@ -18,6 +18,8 @@ pub struct DeviceStatistics {
     pub bonds: u64,
     /// Time for which the server had at least one batch, s.
     pub busy: f64,
+    /// Time that the adapter itself took, s.
+    pub computed: f64,
     /// Time for which calls waited until their batch was sent, s.
     pub waited: f64,
     /// Time of batches of a shape that was new, s: frameworks compile for it.

@@ -154,9 +154,8 @@ impl CalmBaselineArgs {
                 FeatureModel::for_artifact(&self.model, model, &artifact.projection)?
             }
         };
-        let projection = features.stored_projection().unwrap_or_else(|| artifact.projection.clone());
-        artifact
-            .check_belongs_to(&features.symbols(), &projection)
+        features
+            .check_artifact(&artifact)
             .map_err(|error| CommandError::Input(format!("{}: {error}", path.display())))?;
         check_sound(&artifact, path).map_err(CommandError::Input)?;
         Ok((features, Some(artifact)))

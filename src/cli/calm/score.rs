@@ -193,9 +193,8 @@ pub(super) fn load_any(
     let model = LoadedModel::load(export)?;
     let artifact = Artifact::load(path).map_err(CommandError::input)?;
     let model = FeatureModel::for_artifact(export, model, &artifact.projection)?;
-    let own = model.stored_projection().unwrap_or_else(|| artifact.projection.clone());
-    artifact
-        .check_belongs_to(&model.symbols(), &own)
+    model
+        .check_artifact(&artifact)
         .map_err(|error| CommandError::Input(format!("{}: {error}", path.display())))?;
     check_sound(&artifact, path).map_err(CommandError::Input)?;
     Ok((model, artifact))

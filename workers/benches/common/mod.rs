@@ -61,7 +61,7 @@ fn run(
     assignment: &Assignment,
     mixture: &Arc<Mixture>,
 ) -> AssignmentReport<Candidate> {
-    advance(context, assignment, Arc::clone(mixture), || false, |_| {})
+    advance(context, assignment, Arc::clone(mixture), || false, |_| {}).unwrap()
 }
 
 const EQUILIBRATION: u64 = 100;

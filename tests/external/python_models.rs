@@ -1,0 +1,238 @@
+//! Campaigns on models behind a program in Python. Needs a Python with numpy, named by `CALMWALK_PYTHON`; one test needs a Python with
+//! MACE, `CALMWALK_MACE_PYTHON` (`.ci/loaders` makes it).
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+use std::thread::sleep;
+use std::time::Duration;
+
+use crate::common::{Running, config, program, refuse, stderr, succeed};
+
+/// Faults of the server in the campaign that is disturbed.
+const FAULTS: u32 = 50;
+
+/// A campaign on the radial model of the Python tests, with these lines in `[potential.python]`.
+fn write_campaign(directory: &Path, python: &str) {
+    let data = |file: &str| Path::new(env!("CARGO_MANIFEST_DIR")).join(file).display().to_string();
+    let (model, seeds, eam) = (
+        data("python/tests/data/radial-al.json"),
+        data("configs/data/aluminium_seeds.extxyz"),
+        data("configs/data/Al_mm.eam.fs"),
+    );
+    let potential = format!("[potential]\nmodel = {model:?}\n[potential.python]\n{python}\n");
+    fs::write(directory.join("model.toml"), &potential).unwrap();
+    let rule = "rule = \"atom_count\", threshold = 1.1, fraction = 0.02, min_atoms = 2";
+    let text = format!(
+        "[campaign]\nmode = \"reproducible\"\nrng_seed = 7\n{potential}[calm]\nartifact = \"al.npz\"\n\
+         [seed_structures]\nfiles = [{seeds:?}]\n\
+         [walk]\ntemperature = 600.0\nbiased_steps = 400\nequilibration_steps = 20\ntau = 0.3\n\
+         [collect]\ncriterion = {{ {rule} }}\nupdate_target = {{ {rule}, target = 1.0 }}\nmin_interval = 10\nmax_per_walk = 8\n\
+         [guard]\nzbl = {{ rule = \"uniform\", inner = 1.6, outer = 2.4 }}\n\
+         [label]\nmethod = {{ potential = {{ kind = \"eam_fs\", file = {eam:?} }} }}\nconcurrency = 1\n\
+         [run]\nwalkers = 2\nwalks_per_round = 2\n"
+    );
+    fs::write(directory.join("campaign.toml"), text).unwrap();
+}
+
+fn adapter(name: &str, more: &str) -> String {
+    let python = std::env::var("CALMWALK_PYTHON").expect("CALMWALK_PYTHON names a Python with numpy");
+    format!("environment = {python:?}\nadapter = {name:?}\n{more}")
+}
+
+fn build(directory: &Path) {
+    let frames = config("data/al_eam_1l/seed_frames.extxyz").display().to_string();
+    let build = [
+        "calm",
+        "build",
+        "--model",
+        "model.toml",
+        &frames,
+        "--projection-dimension",
+        "8",
+        "--output",
+        "al.npz",
+    ];
+    succeed(directory, build);
+}
+
+fn export(directory: &Path, campaign: &str) -> String {
+    succeed(directory, ["export", campaign, "--control", "--output", "out.extxyz"]);
+    let found = fs::read_to_string(directory.join("out.extxyz")).unwrap();
+    fs::remove_file(directory.join("out.extxyz")).unwrap();
+    found
+}
+
+/// The server dies, stops, has no memory and answers nonsense, fifty times: the data set has the same bytes.
+#[test]
+fn faults_of_the_server_change_nothing() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_campaign(here, &adapter("radial", ""));
+    build(here);
+    succeed(here, ["run", "campaign.toml", "--directory", "plain", "--in-process"]);
+    let control = here.join("control");
+    write_campaign(
+        here,
+        &adapter("simulated", &format!("timeout = \"3s\"\noptions = {{ control = {control:?} }}")),
+    );
+    let mut run =
+        Running(program(here).args(["run", "campaign.toml", "--directory", "disturbed"]).spawn().unwrap());
+    let mut faults = 0;
+    while run.0.try_wait().unwrap().is_none() {
+        sleep(Duration::from_millis(150));
+        let begun = here.join("disturbed/campaign.sqlite").exists();
+        if begun && faults < FAULTS && disturb(here, faults) {
+            faults += 1;
+        }
+    }
+    assert!(run.0.wait().unwrap().success());
+    assert!(faults >= FAULTS / 2, "the campaign was over after {faults} faults");
+    let (plain, disturbed) = (export(here, "plain"), export(here, "disturbed"));
+    assert!(plain == disturbed, "{} and {} bytes", plain.len(), disturbed.len());
+    let status = succeed(here, ["status", "disturbed"]);
+    assert!(status.contains("simulated on cpu") && status.contains("restart"), "{status}");
+}
+
+/// One fault of the server of the campaign in this directory. Returns whether there was one.
+fn disturb(directory: &Path, number: u32) -> bool {
+    let signal = |signal: &str| {
+        let servers = Command::new("pgrep").args(["-f", "calmwalk.server"]).output().unwrap();
+        let pids = String::from_utf8_lossy(&servers.stdout).into_owned();
+        // Other tests have servers, too.
+        let Some(pid) = pids.lines().find(|pid| belongs_to(pid, directory)) else { return false };
+        Command::new("kill").args([signal, pid]).status().unwrap().success()
+    };
+    match number % 12 {
+        0 | 6 => signal("-KILL"),
+        5 => signal("-STOP"),
+        kind => {
+            let control = directory.join("control");
+            if control.exists() {
+                return false;
+            }
+            let faults = ["nan", "exception", "memory", "shape", "exit"];
+            fs::write(directory.join("draft"), faults[kind as usize % faults.len()]).unwrap();
+            fs::rename(directory.join("draft"), control).unwrap();
+            true
+        }
+    }
+}
+
+/// Whether the parent of a process runs the campaign of this directory.
+fn belongs_to(pid: &str, directory: &Path) -> bool {
+    let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+    let parent =
+        status.lines().find_map(|line| line.strip_prefix("PPid:")).map(str::trim).unwrap_or_default();
+    fs::read_link(format!("/proc/{parent}/cwd")).is_ok_and(|found| found == directory)
+}
+
+/// A program that fails at every start ends the walks with the reason; what was collected is labelled.
+#[test]
+fn a_program_that_fails_for_good_ends_walks_but_not_labels() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_campaign(here, &adapter("radial", ""));
+    build(here);
+    let control = here.join("control");
+    write_campaign(here, &adapter("simulated", &format!("options = {{ control = {control:?} }}")));
+    let output = fs::File::create(here.join("said")).unwrap();
+    let mut run = Running(
+        program(here).args(["run", "campaign.toml", "--directory", "c"]).stderr(output).spawn().unwrap(),
+    );
+    let status = loop {
+        if let Some(status) = run.0.try_wait().unwrap() {
+            break status;
+        }
+        sleep(Duration::from_millis(20));
+        let said = fs::read_to_string(here.join("said")).unwrap();
+        if said.contains("candidate") && !control.exists() {
+            fs::write(here.join("draft"), "exit\nexit\nexit\nexit\n").unwrap();
+            fs::rename(here.join("draft"), &control).unwrap();
+        }
+    };
+    let said = fs::read_to_string(here.join("said")).unwrap();
+    assert_eq!(status.code(), Some(1), "{said}");
+    assert!(said.contains("failed three times in a row") && said.contains("adapter simulated"), "{said}");
+    let queue = succeed(here, ["queue", "c", "list", "--state", "queued"]);
+    let labelled = succeed(here, ["queue", "c", "list", "--state", "labelled"]);
+    assert!(labelled.lines().count() > 1 && queue.lines().count() <= 2, "{labelled}\n{queue}");
+    fs::remove_file(&control).ok();
+    let goes_on = program(here).args(["run", "campaign.toml", "--directory", "c"]).output().unwrap();
+    assert!(goes_on.status.success(), "{}", stderr(&goes_on));
+}
+
+/// What is wrong is said by the name of its key, before anything runs.
+#[test]
+fn wrong_models_are_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_campaign(here, &adapter("radial", ""));
+    build(here);
+    let wrong = [
+        (adapter("simulated", "options = { bend = { forces = 1.1 } }"), "the force of a cluster"),
+        (adapter("simulated", "options = { noise = 1e-13 }"), "campaign.mode"),
+        (adapter("simulated", "options = { crowd = 1e-13 }"), "potential.python.max_batch = 1"),
+        (adapter("nothing", ""), "nothing"),
+        ("environment = \"/nowhere\"\nadapter = \"radial\"".to_owned(), "/nowhere"),
+        (adapter("radial", "max_batch = 0"), "max_batch"),
+    ];
+    for (python, expected) in wrong {
+        write_campaign(here, &python);
+        let said = refuse(here, ["validate", "campaign.toml"]);
+        assert!(said.contains("campaign.toml:") && said.contains(expected), "{python}: {said}");
+    }
+}
+
+/// MACE with random weights: mixture, scores, selection, and a campaign whose labels are those of an ASE calculator.
+#[test]
+fn mace_has_a_campaign() {
+    let python =
+        std::env::var("CALMWALK_MACE_PYTHON").expect("CALMWALK_MACE_PYTHON names a Python with MACE");
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let maker = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/tests/make_mace.py");
+    let made = Command::new(&python).arg(maker).arg("mace.model").current_dir(here).output().unwrap();
+    assert!(made.status.success(), "{}", stderr(&made));
+    write_campaign(here, &format!("environment = {python:?}\nadapter = \"mace\""));
+    for file in ["model.toml", "campaign.toml"] {
+        let text = fs::read_to_string(here.join(file)).unwrap();
+        let line = text.lines().find(|line| line.starts_with("model = ")).unwrap();
+        let text =
+            text.replace(line, "model = \"mace.model\"").replace("biased_steps = 400", "biased_steps = 60");
+        fs::write(here.join(file), text).unwrap();
+    }
+    build(here);
+    let seeds = config("data/aluminium_seeds.extxyz").display().to_string();
+    succeed(
+        here,
+        [
+            "calm",
+            "score",
+            "--model",
+            "model.toml",
+            "--artifact",
+            "al.npz",
+            &seeds,
+            "--output",
+            "scores.extxyz",
+        ],
+    );
+    succeed(
+        here,
+        [
+            "select",
+            "--model",
+            "model.toml",
+            "--artifact",
+            "al.npz",
+            &seeds,
+            "-n",
+            "3",
+            "--output",
+            "picks.extxyz",
+        ],
+    );
+    succeed(here, ["run", "campaign.toml", "--directory", "c"]);
+    assert!(export(here, "c").contains("Al"));
+}
