@@ -67,7 +67,7 @@ const fn range(
 }
 
 /// All ranges, by table.
-pub static RANGES: [Range; 115] = [
+pub static RANGES: [Range; 116] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -75,6 +75,7 @@ pub static RANGES: [Range; 115] = [
     range("walk.time_step", "fs", [0.0, 20.0], [0.1, 5.0], FEMTOSECONDS),
     range("walk.thermostat.langevin.friction", "1/fs", [0.0, 100.0], [1e-4, 0.2], PER_FEMTOSECOND),
     range("walk.thermostat.nose_hoover.relaxation_time", "fs", [0.0, 1e6], [10.0, 5e3], FEMTOSECONDS),
+    range("walk.thermostat.velocity_rescaling.relaxation_time", "fs", [0.0, 1e6], [10.0, 5e3], FEMTOSECONDS),
     range("walk.thermostat.nose_hoover.chain_length", "", [1.0, 100.0], [1.0, 10.0], ""),
     range("walk.volume_ramp.from", "V/V₀", [0.05, 20.0], [0.4, 3.0], RELATIVE_VOLUME),
     range("walk.volume_ramp.to", "V/V₀", [0.05, 20.0], [0.4, 3.0], RELATIVE_VOLUME),

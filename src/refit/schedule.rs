@@ -179,7 +179,7 @@ mod tests {
         schedule.taken_up = 1;
         schedule.progress.rules.min_improvement = Some(0.15);
         let in_force = |schedule: &RefitSchedule| schedule.in_force().map_or(0, |version| version.number);
-        assert!(!schedule.progress.small_improvement().is_some() && schedule.progress.is_refit_left());
+        assert!(schedule.progress.small_improvement().is_none() && schedule.progress.is_refit_left());
         assert_eq!((in_force(&schedule), schedule.refit_at(&refit)), (2, Some(7)));
         schedule.progress.rules.min_improvement = Some(0.25);
         assert!(schedule.progress.small_improvement().is_some() && schedule.is_newest_without_walks());

@@ -17,7 +17,7 @@ use store::{
     Budget, BudgetStatus, BudgetUse, Declined, FailureCount, LabelJobCounts, OldestLease, ProcessRecord,
     Unlabelled, ValueRange, WalkStatus, unix_milliseconds,
 };
-use wire::{CampaignId, WalkConditions};
+use wire::{CampaignId, DeviceStatistics, WalkConditions};
 
 use super::*;
 
@@ -67,6 +67,15 @@ pub fn large() -> Snapshot {
             Path::new("/scratch"),
         )),
         status: status(),
+        device: Some(DeviceStatistics {
+            adapter: "gracemaker".into(),
+            device: "cuda:1".into(),
+            last_failure: Some(
+                "adapter gracemaker in /opt/a-long-name-of-an-environment: no answer for 60 s".into(),
+            ),
+            restarts: 3,
+            ..DeviceStatistics::default()
+        }),
         mixture: MixtureValues(values.map(|(name, value)| (name.to_owned(), value.to_string())).into()),
         disk: DiskUse {
             bytes: 123_456_789_012,

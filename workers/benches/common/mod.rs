@@ -26,7 +26,7 @@ pub struct TimedWalk {
 impl TimedWalk {
     pub fn new(model: &Arc<GraceModel>, mixture: &Arc<Mixture>, seed_structure: Structure) -> Self {
         let context = |threshold| WalkContext {
-            model: Arc::clone(model),
+            model: model.clone(),
             threads: Threads::default(),
             settings: Arc::new(settings(threshold)),
         };
