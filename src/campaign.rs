@@ -209,9 +209,9 @@ impl LoadedCampaign {
         value["files"] = Value::Object(hashes.collect());
         value["label"]["protocol"] = json!(self.config.label.protocol_name());
         value["label"]["method"] = resolved_method(&self.config.label, &self.protocol);
-        // Its place and its processor cores change no result.
-        match self.config.potential.python {
-            Some(_) => value["potential"]["python"] = json!({ "identity": self.hash_of("potential.model") }),
+        match value["potential"]["python"].as_object_mut() {
+            // The hash of the model is one of its adapter, too.
+            Some(python) => drop(python.remove("adapter")),
             None => drop(value["potential"].as_object_mut().map(|potential| potential.remove("python"))),
         }
         // Campaigns that began before this key existed have none.

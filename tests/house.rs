@@ -18,6 +18,7 @@ const HOUSE: [(&str, &str, &[&str]); 16] = [
     ("upfit", "crates/upfit", &["analysis", "atoms", "calm", "potentials"]),
     ("batch", "crates/batch", &[]),
     ("wire", "crates/wire", &["atoms", "calm"]),
+    ("bridge", "crates/bridge", &["atoms", "calm", "potentials", "wire"]),
     ("store", "store", &["atoms", "wire"]),
     ("monitor", "monitor", &["analysis", "atoms", "calm", "store", "wire"]),
     (
@@ -39,6 +40,7 @@ const HOUSE: [(&str, &str, &[&str]); 16] = [
             "analysis",
             "figures",
             "upfit",
+            "bridge",
             "wire",
             "store",
             "monitor",

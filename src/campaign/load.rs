@@ -79,6 +79,16 @@ impl Loader<'_> {
 
     /// Reproducible campaigns need results that depend on the structure only.
     fn check_python(&self, model: &PythonModel) -> Result<(), ConfigError> {
+        if self.config.refit.is_some() {
+            let key = "refit".to_owned();
+            let expected = "left out with potential.python: refits train exported GRACE models".to_owned();
+            return Err(ConfigError::Value {
+                at: location(self.path, self.text, &key),
+                key,
+                found: "a section".to_owned(),
+                expected,
+            });
+        }
         let Some(test) = model.device().map(|device| &device.info().self_test) else { return Ok(()) };
         let alone = self.config.potential.python.as_ref().is_some_and(|python| python.max_batch.get() == 1);
         let expected = if !test.is_deterministic {

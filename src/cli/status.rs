@@ -139,7 +139,7 @@ fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &StatusLayout) -> 
     if let Some(budget) = budget::describe(&status.budget) {
         page.titled(out, "budget", &budget)?;
     }
-    if let Some(device) = device {
+    if let Some(device) = device.as_ref().filter(|_| page.is_unlimited()) {
         page.titled(out, "device", &wording::device::describe(device))?;
     }
     page.titled(out, "disk", &describe_disk(disk, page, status))?;

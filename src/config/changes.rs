@@ -5,8 +5,16 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may change when a campaign is resumed; all others keep their first values.
-pub(super) const CHANGEABLE: [&str; 83] = [
+pub(super) const CHANGEABLE: [&str; 91] = [
     "campaign.control_share",
+    "potential.python.environment",
+    "potential.python.launcher",
+    "potential.python.device",
+    "potential.python.threads",
+    "potential.python.max_batch",
+    "potential.python.timeout",
+    "potential.python.compile_timeout",
+    "potential.python.cache",
     "seed_structures",
     "collect.max_per_walk",
     "collect.max_per_seed_structure",

@@ -212,7 +212,7 @@ fn check_mixture(config: &Config) -> Result<(), InvalidValue> {
     Ok(())
 }
 
-/// A program in Python has no mixture of its own, and this program does not train it.
+/// A program in Python has no mixture of its own.
 fn check_python(config: &Config) -> Result<(), InvalidValue> {
     if config.potential.python.is_none() {
         return Ok(());
@@ -221,10 +221,6 @@ fn check_python(config: &Config) -> Result<(), InvalidValue> {
         let expected =
             "the artifact of a mixture for this model: build one with calmwalk calm build --model CONFIG";
         return wrong("calm.artifact", "left out", expected);
-    }
-    if config.refit.is_some() {
-        let expected = "left out with [potential.python]: refits train exported GRACE models";
-        return wrong("refit", "a section", expected);
     }
     Ok(())
 }

@@ -60,13 +60,12 @@ mod tests {
         let known = |name: &&String| MODULES.iter().any(|(module, _)| module == name);
         let adapters = names("adapters/");
         assert_eq!(adapters.iter().filter(known).count(), adapters.len(), "{adapters:?}");
-        // What the server imports.
+        // What the server imports; campaigns are read by who has installed the package.
         for (name, text) in MODULES {
             for line in text.lines().filter_map(|line| line.trim().strip_prefix("from .")) {
                 let module = line.trim_start_matches('.').split_whitespace().next().unwrap_or_default();
                 let file = format!("{module}.py");
-                let is_there = module.is_empty()
-                    || module == "import"
+                let is_there = ["", "import", "campaign"].contains(&module)
                     || MODULES.iter().any(|(path, _)| path.ends_with(&file));
                 assert!(is_there || package.join(module).is_dir(), "{name} imports {module}");
             }

@@ -4,8 +4,6 @@
 mod expected;
 mod learning;
 mod reader;
-#[cfg(test)]
-mod reader_tests;
 mod summary;
 #[cfg(test)]
 mod tests;

@@ -1,5 +1,8 @@
 //! Calibrations that are kept up to date with the labels of a campaign.
 
+#[cfg(test)]
+mod tests;
+
 use std::collections::BTreeMap;
 
 use store::{ArrivalSum, LabelArrival, Store, StoreError, WalkVersions};

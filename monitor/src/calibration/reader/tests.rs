@@ -11,7 +11,7 @@ use store::{
 use wire::messages::WalkProgress;
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
-use super::{CalibrationReader, CalibrationState, read};
+use super::super::{CalibrationReader, CalibrationState, read};
 
 const CAMPAIGN: CampaignId = CampaignId([5; 16]);
 const PROTOCOL: ContentHash = ContentHash([3; 32]);
