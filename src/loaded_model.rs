@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use bridge::{Device, FeatureForm, PythonModel};
+use bridge::{AdapterFeatures, Device, PythonModel};
 use calm::Projection;
 use potentials::ModelWithFeatures;
 use potentials::grace::{GraceModel, Precision, RadialPath};
@@ -115,7 +115,7 @@ impl LoadedModel {
 
     /// Whether a program in Python gives the features as they are graded.
     pub fn has_final_features(&self) -> bool {
-        matches!(self, Self::Python(model) if model.description().features.form == FeatureForm::Final)
+        matches!(self, Self::Python(model) if model.description().features.form == AdapterFeatures::Final)
     }
 
     /// Number of invariants, and of the layers that they come from; `None` for a model without invariants.
@@ -127,7 +127,7 @@ impl LoadedModel {
             }
             Self::Python(model) => {
                 let features = &model.description().features;
-                (features.form == FeatureForm::Raw).then_some((features.dimension, features.blocks.len()))
+                (features.form == AdapterFeatures::Raw).then_some((features.dimension, features.blocks.len()))
             }
         }
     }

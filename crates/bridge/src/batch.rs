@@ -9,7 +9,7 @@ use bytemuck::{Pod, cast_slice, cast_slice_mut};
 use serde::Serialize;
 
 use crate::arena::Arena;
-use crate::call::{Geometry, Topology};
+use crate::call::{BondGeometry, Topology};
 use crate::shapes::Shape;
 
 /// Sections begin at multiples of this, bytes.
@@ -146,7 +146,7 @@ impl BatchArena {
     ///
     /// # Errors
     /// Shared memory that is full.
-    pub fn write(&mut self, structures: &[&Geometry], padding: bool, cutoff: f64) -> std::io::Result<()> {
+    pub fn write(&mut self, structures: &[&BondGeometry], padding: bool, cutoff: f64) -> std::io::Result<()> {
         self.real = structures.iter().fold(Shape::default(), |sum, one| sum.plus(one.shape()));
         let padded = if padding { self.real.padded() } else { self.real };
         let layout = Layout::new(padded, self.dimension);
@@ -201,7 +201,7 @@ impl BatchArena {
         self.topologies = topologies;
     }
 
-    fn write_geometry(&mut self, structures: &[&Geometry], cutoff: f64) {
+    fn write_geometry(&mut self, structures: &[&BondGeometry], cutoff: f64) {
         let beyond = [100.0 + 2.0 * cutoff, 0.0, 0.0];
         let bonds = self.section::<[f64; 3]>("bonds");
         let mut rest = bonds;

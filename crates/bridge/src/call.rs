@@ -22,7 +22,7 @@ pub struct Topology {
 
 /// Positions of a structure and its bonds.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Geometry {
+pub struct BondGeometry {
     /// Elements and bonds.
     pub topology: Arc<Topology>,
     /// Positions, `[n]`, Å.
@@ -39,7 +39,7 @@ pub enum Call {
     /// Energies, forces and virial of a structure.
     Evaluate {
         /// The structure.
-        geometry: Geometry,
+        geometry: BondGeometry,
         /// Whether the features are wanted too.
         features: bool,
         /// Whether the client will call for a pull-back, so that the device keeps what it needs for that.
@@ -81,7 +81,7 @@ impl Topology {
     }
 }
 
-impl Geometry {
+impl BondGeometry {
     /// The geometry of a structure with these bonds.
     pub(crate) fn of(structure: &Structure, topology: Arc<Topology>) -> Self {
         Self {
@@ -126,7 +126,7 @@ fn half(count: usize) -> usize {
 }
 
 /// The words of an evaluation in shared memory; `topology`: whether it is sent along.
-pub(crate) fn evaluate_words(geometry: &Geometry, topology: bool) -> usize {
+pub(crate) fn evaluate_words(geometry: &BondGeometry, topology: bool) -> usize {
     let Shape { atoms, bonds, .. } = geometry.shape();
     let integers = if topology { half(atoms) + 2 * half(bonds) + half(3 * bonds) } else { 0 };
     HEAD + 3 * atoms + CELL + integers
@@ -134,7 +134,7 @@ pub(crate) fn evaluate_words(geometry: &Geometry, topology: bool) -> usize {
 
 /// Writes an evaluation.
 pub(crate) fn write_evaluate(
-    geometry: &Geometry,
+    geometry: &BondGeometry,
     (features, follows): (bool, bool),
     topology: bool,
     words: &mut [u64],
@@ -209,7 +209,7 @@ fn read_evaluate(words: &[u64], last: Option<&Arc<Topology>>) -> Result<Call, St
     }
     let cell: [[f64; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|k| cell[3 * i + k]));
     let periodic = std::array::from_fn(|k| options >> (8 + k) & 1 == 1);
-    let geometry = Geometry { topology, positions: positions.as_chunks().0.to_vec(), cell, periodic };
+    let geometry = BondGeometry { topology, positions: positions.as_chunks().0.to_vec(), cell, periodic };
     Ok(Call::Evaluate { geometry, features: options & 1 == 1, pull_back_follows: options & 2 == 2 })
 }
 
@@ -219,7 +219,7 @@ mod tests {
 
     use super::*;
 
-    fn geometries() -> impl Strategy<Value = Geometry> {
+    fn geometries() -> impl Strategy<Value = BondGeometry> {
         (1_usize..20, 0_usize..40).prop_flat_map(|(atoms, bonds)| {
             let index = || prop::collection::vec(0..atoms as i32, bonds);
             let images = prop::collection::vec(prop::array::uniform3(-3_i32..4), bonds);
@@ -229,7 +229,7 @@ mod tests {
             (species, index(), index(), images, numbers, cell, prop::array::uniform3(any::<bool>())).prop_map(
                 |(species, centres, neighbours, images, positions, cell, periodic)| {
                     let topology = Arc::new(Topology { species, centres, neighbours, images });
-                    Geometry { topology, positions, cell, periodic }
+                    BondGeometry { topology, positions, cell, periodic }
                 },
             )
         })

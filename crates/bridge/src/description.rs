@@ -40,7 +40,7 @@ pub struct ModelDescription {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RawFeatures {
     /// What they are.
-    pub form: FeatureForm,
+    pub form: AdapterFeatures,
     /// Number of features of an atom.
     pub dimension: usize,
     /// Columns of each layer.
@@ -50,7 +50,7 @@ pub struct RawFeatures {
 /// What the features of an adapter are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum FeatureForm {
+pub enum AdapterFeatures {
     /// As they are graded.
     Final,
     /// Invariants, which calmwalk normalises and projects.
@@ -91,7 +91,7 @@ impl ModelDescription {
         }
         let RawFeatures { form, dimension, blocks } = &self.features;
         let columns: usize = blocks.iter().sum();
-        let has_features = *form != FeatureForm::None;
+        let has_features = *form != AdapterFeatures::None;
         if has_features && (columns != *dimension || columns == 0 || blocks.contains(&0)) {
             return Err(format!("features: {dimension} features in blocks of {blocks:?}"));
         }

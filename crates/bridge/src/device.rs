@@ -12,12 +12,12 @@ use tokio_util::sync::CancellationToken;
 use wire::DeviceStatistics;
 use wire::ipc::IncomingCall;
 
-use crate::call::{Call, Geometry, Topology};
+use crate::call::{BondGeometry, Call, Topology};
 use crate::description::ModelDescription;
 use crate::model::PythonModel;
 use crate::self_test::{SelfTestError, SelfTestReport};
 use crate::settings::PythonSettings;
-use crate::worker::{Event, Worker};
+use crate::worker::{DeviceEvent, Worker};
 
 /// Why a device cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -78,7 +78,7 @@ pub struct DeviceInfo {
 /// A running device. Dropping it ends its server.
 #[derive(Debug)]
 pub struct Device {
-    events: Sender<Event>,
+    events: Sender<DeviceEvent>,
     info: DeviceInfo,
     statistics: Arc<Mutex<DeviceStatistics>>,
     thread: Option<JoinHandle<()>>,
@@ -168,9 +168,9 @@ impl Device {
         let species = model.element_indices(&structure.species).map_err(|error| error.to_string())?;
         let mut list = NeighbourList::new(model.description().cutoff(), skin);
         list.update(structure).map_err(|error| error.to_string())?;
-        let geometry = Geometry::of(structure, Topology::of(&species, &list, None));
+        let geometry = BondGeometry::of(structure, Topology::of(&species, &list, None));
         let (done, ended) = mpsc::sync_channel(1);
-        if self.events.send(Event::WarmUp { geometry, done }).is_ok() {
+        if self.events.send(DeviceEvent::WarmUp { geometry, done }).is_ok() {
             // The thread may have crashed.
             let _ = ended.recv();
         }
@@ -189,8 +189,8 @@ impl Device {
     }
 
     pub(crate) fn submit(&self, client: u64, call: Result<Call, String>, recipient: Recipient) {
-        if let Err(unsent) = self.events.send(Event::Call { client, call, recipient })
-            && let Event::Call { recipient, .. } = unsent.0
+        if let Err(unsent) = self.events.send(DeviceEvent::Call { client, call, recipient })
+            && let DeviceEvent::Call { recipient, .. } = unsent.0
         {
             recipient.refuse(&CallError::Unavailable("the device has ended".to_owned()));
         }
@@ -200,7 +200,7 @@ impl Device {
 impl Drop for Device {
     fn drop(&mut self) {
         self.stop.cancel();
-        let _ = self.events.send(Event::Close);
+        let _ = self.events.send(DeviceEvent::Close);
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }

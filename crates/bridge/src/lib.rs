@@ -23,8 +23,8 @@ mod settings;
 mod shapes;
 mod worker;
 
-pub use call::{Geometry, Topology};
-pub use description::{FeatureForm, ModelDescription, RawFeatures};
+pub use call::{BondGeometry, Topology};
+pub use description::{AdapterFeatures, ModelDescription, RawFeatures};
 pub use device::{CallError, Device, DeviceError, DeviceInfo};
 pub use feature_map::RawProjection;
 pub use model::PythonModel;

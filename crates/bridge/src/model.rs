@@ -9,7 +9,7 @@ use potentials::{ModelWithFeatures, PotentialWithFeatures};
 use tokio_util::sync::CancellationToken;
 use wire::ipc::CallAddress;
 
-use crate::description::{FeatureForm, ModelDescription, RawFeatures};
+use crate::description::{AdapterFeatures, ModelDescription, RawFeatures};
 use crate::device::Device;
 use crate::feature_map::RawProjection;
 use crate::potential::PythonPotential;
@@ -71,9 +71,11 @@ impl PythonModel {
     pub fn projected(&self, projection: calm::Projection) -> Result<Self, String> {
         let RawFeatures { form, blocks, .. } = &self.description.features;
         let projection = match form {
-            FeatureForm::Raw => Some(RawProjection::new(projection, blocks)?),
-            FeatureForm::Final => return Err("the model's program gives features that are final".to_owned()),
-            FeatureForm::None => {
+            AdapterFeatures::Raw => Some(RawProjection::new(projection, blocks)?),
+            AdapterFeatures::Final => {
+                return Err("the model's program gives features that are final".to_owned());
+            }
+            AdapterFeatures::None => {
                 return Err("the model's program gives no features, so nothing can be graded".to_owned());
             }
         };
@@ -120,8 +122,8 @@ impl ModelWithFeatures for PythonModel {
     /// 0 without features, or with invariants that are not projected.
     fn feature_dimension(&self) -> usize {
         match (self.description.features.form, &self.projection) {
-            (FeatureForm::Final, _) => self.description.features.dimension,
-            (FeatureForm::Raw, Some(projection)) => projection.dimension(),
+            (AdapterFeatures::Final, _) => self.description.features.dimension,
+            (AdapterFeatures::Raw, Some(projection)) => projection.dimension(),
             _ => 0,
         }
     }

@@ -8,7 +8,7 @@ use potentials::grace::{GradeFunction, PullBack};
 use potentials::{ModelWithFeatures, PotentialWithFeatures};
 use wire::ipc::CallClient;
 
-use crate::call::{self, Call, Geometry, Topology};
+use crate::call::{self, BondGeometry, Call, Topology};
 use crate::device::{CallError, Device, status};
 use crate::feature_map::MappedFeatures;
 use crate::model::{Connection, PythonModel};
@@ -68,7 +68,7 @@ impl PythonPotential {
         let species = self.model.element_indices(&structure.species)?;
         let topology = Topology::of(&species, neighbours, self.topology.as_ref());
         self.topology = Some(Arc::clone(&topology));
-        let geometry = Geometry::of(structure, topology);
+        let geometry = BondGeometry::of(structure, topology);
         let numbers = self.client()?.evaluate(geometry, (features, pull_back_follows))?;
         let n = structure.len();
         let width = if features { self.model.description().features.dimension } else { 0 };
@@ -141,7 +141,11 @@ impl Client {
         }
     }
 
-    fn evaluate(&mut self, geometry: Geometry, options: (bool, bool)) -> Result<Vec<f64>, PotentialError> {
+    fn evaluate(
+        &mut self,
+        geometry: BondGeometry,
+        options: (bool, bool),
+    ) -> Result<Vec<f64>, PotentialError> {
         let (features, pull_back_follows) = options;
         match self {
             Self::Local { device, number } => {

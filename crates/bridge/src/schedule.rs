@@ -19,7 +19,7 @@ const ABSENT_AFTER: Duration = Duration::from_millis(500);
 const AHEAD: usize = 2;
 
 /// Number of one of the two slots.
-pub type Slot = usize;
+pub type DeviceSlot = usize;
 
 /// What a call asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,25 +54,25 @@ pub struct Ticket {
 
 /// A batch to send to the server.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Batch {
+pub enum DeviceBatch {
     /// An evaluation.
     Evaluate {
         /// Where it is kept.
-        slot: Slot,
+        slot: DeviceSlot,
         /// Its calls.
         tickets: Vec<Ticket>,
     },
     /// Pull-backs for the kept evaluation of the slot: one for each member, in order, `None` for those that have not come.
     PullBackKept {
         /// Where the evaluation is.
-        slot: Slot,
+        slot: DeviceSlot,
         /// Its calls.
         tickets: Vec<Option<Ticket>>,
     },
     /// Pull-backs that need an evaluation of their own.
     PullBackAnew {
         /// Where it is kept meanwhile.
-        slot: Slot,
+        slot: DeviceSlot,
         /// Its calls.
         tickets: Vec<Ticket>,
     },
@@ -82,7 +82,7 @@ pub enum Batch {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Next {
     /// Send this batch.
-    Send(Batch),
+    Send(DeviceBatch),
     /// Nothing before this time, unless a call or an answer comes.
     WaitUntil(Instant),
     /// Nothing, until a call or an answer comes.
@@ -104,7 +104,7 @@ enum SlotState {
 pub struct Schedule {
     slots: [SlotState; 2],
     /// Slots of the batches that the server has, in order.
-    sent: VecDeque<Slot>,
+    sent: VecDeque<DeviceSlot>,
     waiting: VecDeque<Ticket>,
     last_call: HashMap<u64, Instant>,
     max_structures: usize,
@@ -221,16 +221,16 @@ impl Schedule {
     }
 
     /// Whether all members that will pull back have called.
-    fn is_complete(&self, slot: Slot) -> bool {
+    fn is_complete(&self, slot: DeviceSlot) -> bool {
         let SlotState::Kept { members, arrived, .. } = &self.slots[slot] else { return false };
         members.iter().zip(arrived).all(|((_, follows), call)| call.is_some() || !follows)
     }
 
-    fn free_slot(&self) -> Option<Slot> {
+    fn free_slot(&self) -> Option<DeviceSlot> {
         self.slots.iter().position(|slot| matches!(slot, SlotState::Free))
     }
 
-    fn oldest_kept(&self) -> Option<(Slot, Instant)> {
+    fn oldest_kept(&self) -> Option<(DeviceSlot, Instant)> {
         let kept = self.slots.iter().enumerate().filter_map(|(slot, state)| match state {
             SlotState::Kept { since, .. } => Some((slot, *since)),
             _ => None,
@@ -239,7 +239,7 @@ impl Schedule {
     }
 
     /// Pulls back what has come, or frees the slot if nothing has.
-    fn give_up_waiting(&mut self, slot: Slot, now: Instant) -> Next {
+    fn give_up_waiting(&mut self, slot: DeviceSlot, now: Instant) -> Next {
         let SlotState::Kept { arrived, .. } = &self.slots[slot] else { return Next::Wait };
         if arrived.iter().any(Option::is_some) {
             return Next::Send(self.pull_back(slot));
@@ -248,11 +248,11 @@ impl Schedule {
         self.next(now)
     }
 
-    fn pull_back(&mut self, slot: Slot) -> Batch {
+    fn pull_back(&mut self, slot: DeviceSlot) -> DeviceBatch {
         let state = std::mem::replace(&mut self.slots[slot], SlotState::Computing { members: Vec::new() });
         self.sent.push_back(slot);
         let tickets = if let SlotState::Kept { arrived, .. } = state { arrived } else { Vec::new() };
-        Batch::PullBackKept { slot, tickets }
+        DeviceBatch::PullBackKept { slot, tickets }
     }
 
     fn fills_a_batch(&self) -> bool {
@@ -276,7 +276,7 @@ impl Schedule {
     }
 
     /// Takes calls of one kind, in the order in which they came.
-    fn take(&mut self, slot: Slot) -> Batch {
+    fn take(&mut self, slot: DeviceSlot) -> DeviceBatch {
         let mut taken: Vec<Ticket> = Vec::new();
         let mut left = VecDeque::new();
         let mut bonds = 0;
@@ -305,9 +305,9 @@ impl Schedule {
         let members = taken.iter().map(|ticket| (ticket.client, follows(ticket))).collect();
         self.slots[slot] = SlotState::Computing { members };
         if anew {
-            Batch::PullBackAnew { slot, tickets: taken }
+            DeviceBatch::PullBackAnew { slot, tickets: taken }
         } else {
-            Batch::Evaluate { slot, tickets: taken }
+            DeviceBatch::Evaluate { slot, tickets: taken }
         }
     }
 }
@@ -316,7 +316,7 @@ fn is_pull_back(ticket: &Ticket) -> bool {
     ticket.kind == Kind::PullBack
 }
 
-impl Batch {
+impl DeviceBatch {
     /// Its calls.
     pub fn tickets(&self) -> Vec<Ticket> {
         match self {

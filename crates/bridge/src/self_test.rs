@@ -2,7 +2,7 @@
 
 use atoms::{Cell, NeighbourList, Species, Structure, StructureError};
 
-use crate::call::{Geometry, Topology};
+use crate::call::{BondGeometry, Topology};
 
 /// Distance of the atoms of the test in sums of covalent radii.
 const SPACING: f64 = 1.1;
@@ -18,11 +18,11 @@ const ROUNDING: f64 = 30.0;
 /// What a model evaluates at once, for the test.
 pub(crate) trait Evaluate {
     /// The energies, vectors, virial and features of each structure, or what went wrong.
-    fn evaluate(&mut self, structures: &[&Geometry]) -> Result<Vec<TestResult>, String>;
+    fn evaluate(&mut self, structures: &[&BondGeometry]) -> Result<Vec<TestResult>, String>;
     /// Gradients and virials of the pull-back for each structure.
     fn pull_back(
         &mut self,
-        structures: &[&Geometry],
+        structures: &[&BondGeometry],
         cotangents: &[&[f64]],
     ) -> Result<Vec<TestResult>, String>;
 }
@@ -108,7 +108,7 @@ pub(crate) fn run(
 }
 
 /// The structure that shows later whether a server still gives what it gave at the start.
-pub(crate) fn reference(subject: &TestSubject<'_>) -> Result<Geometry, StructureError> {
+pub(crate) fn reference(subject: &TestSubject<'_>) -> Result<BondGeometry, StructureError> {
     geometry(&structure(subject.elements, false), subject, 0.3)
 }
 
@@ -318,13 +318,17 @@ impl<M: Evaluate> SelfTest<'_, M> {
 const STENCIL: [(f64, f64); 4] =
     [(-2.0, 1.0 / 12.0), (-1.0, -8.0 / 12.0), (1.0, 8.0 / 12.0), (2.0, -1.0 / 12.0)];
 
-fn geometry(structure: &Structure, subject: &TestSubject<'_>, skin: f64) -> Result<Geometry, StructureError> {
+fn geometry(
+    structure: &Structure,
+    subject: &TestSubject<'_>,
+    skin: f64,
+) -> Result<BondGeometry, StructureError> {
     let mut list = NeighbourList::new(subject.cutoff, skin);
     list.update(structure)?;
     let index =
         |species: &Species| subject.elements.iter().position(|known| known == species).unwrap_or_default();
     let species: Vec<usize> = structure.species.iter().map(index).collect();
-    Ok(Geometry::of(structure, Topology::of(&species, &list, None)))
+    Ok(BondGeometry::of(structure, Topology::of(&species, &list, None)))
 }
 
 /// Eight atoms on a distorted cubic lattice, of all elements in turn.

@@ -10,14 +10,14 @@ use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
 use crate::batch::{BatchArena, BatchKind};
-use crate::call::Geometry;
-use crate::description::{FeatureForm, ModelDescription, PROTOCOL};
+use crate::call::BondGeometry;
+use crate::description::{AdapterFeatures, ModelDescription, PROTOCOL};
 use crate::faults::{Fault, Reply};
 use crate::process::{ServerEvent, ServerProcess};
 use crate::self_test::{Evaluate, TestResult};
 use crate::settings::PythonSettings;
 use crate::shapes::Shape;
-use crate::worker::Event;
+use crate::worker::DeviceEvent;
 
 /// Interval at which a synchronous call looks whether the device was asked to stop.
 const LOOK_AROUND: Duration = Duration::from_millis(200);
@@ -52,7 +52,7 @@ pub(crate) struct ServerSetup<'a> {
     pub package: &'a Path,
     /// Where arenas are made.
     pub memory: &'a Path,
-    pub events: &'a Sender<Event>,
+    pub events: &'a Sender<DeviceEvent>,
     pub stop: &'a CancellationToken,
 }
 
@@ -64,11 +64,11 @@ impl Server {
     pub fn start(
         setup: &ServerSetup<'_>,
         generation: u64,
-        incoming: &Receiver<Event>,
-        early: &mut Vec<Event>,
+        incoming: &Receiver<DeviceEvent>,
+        early: &mut Vec<DeviceEvent>,
     ) -> Result<Self, Fault> {
         let settings = setup.settings;
-        let tag = move |event| Event::Server { generation, event };
+        let tag = move |event| DeviceEvent::Server { generation, event };
         let mut process = ServerProcess::start(settings, setup.package, setup.events.clone(), tag)
             .map_err(Fault::Exited)?;
         let precision = match settings.precision {
@@ -96,7 +96,7 @@ impl Server {
         match description {
             Ok(description) => {
                 let dimension = match description.features.form {
-                    FeatureForm::None => 0,
+                    AdapterFeatures::None => 0,
                     _ => description.features.dimension,
                 };
                 let arenas = [0, 1].map(|number| BatchArena::new(setup.memory, number, dimension));
@@ -126,7 +126,7 @@ impl Server {
     ///
     /// # Errors
     /// Shared memory that is full.
-    pub fn write(&mut self, slot: usize, structures: &[&Geometry]) -> Result<(), Fault> {
+    pub fn write(&mut self, slot: usize, structures: &[&BondGeometry]) -> Result<(), Fault> {
         let (padding, cutoff) = (self.description.padding, self.description.cutoff());
         self.evaluations[slot] = None;
         let written = self.arenas[slot].write(structures, padding, cutoff);
@@ -187,8 +187,8 @@ fn with_end(fault: Fault, process: ServerProcess) -> Fault {
 pub(crate) struct Wait<'a> {
     pub setup: &'a ServerSetup<'a>,
     pub generation: u64,
-    pub incoming: &'a Receiver<Event>,
-    pub early: &'a mut Vec<Event>,
+    pub incoming: &'a Receiver<DeviceEvent>,
+    pub early: &'a mut Vec<DeviceEvent>,
 }
 
 impl Wait<'_> {
@@ -207,13 +207,14 @@ impl Wait<'_> {
                 return Err(Fault::Timeout(format!("{names}, {call}: no answer in time")));
             }
             match self.incoming.recv_timeout(left.min(LOOK_AROUND)) {
-                Ok(Event::Server { generation, event }) if generation == self.generation => match event {
+                Ok(DeviceEvent::Server { generation, event }) if generation == self.generation => match event
+                {
                     ServerEvent::Line(line) => return Ok(line),
                     ServerEvent::Ended => {
                         return Err(Fault::Exited(format!("{names}, {call}: no answer")));
                     }
                 },
-                Ok(Event::Server { .. }) | Err(RecvTimeoutError::Timeout) => {}
+                Ok(DeviceEvent::Server { .. }) | Err(RecvTimeoutError::Timeout) => {}
                 Ok(other) => self.early.push(other),
                 Err(RecvTimeoutError::Disconnected) => return Err(Fault::Stopped),
             }
@@ -225,8 +226,8 @@ impl Wait<'_> {
 pub(crate) struct Synchronous<'a> {
     pub server: &'a mut Server,
     pub setup: &'a ServerSetup<'a>,
-    pub incoming: &'a Receiver<Event>,
-    pub early: &'a mut Vec<Event>,
+    pub incoming: &'a Receiver<DeviceEvent>,
+    pub early: &'a mut Vec<DeviceEvent>,
     /// The last fault, as the test knows messages only.
     pub fault: Option<Fault>,
 }
@@ -238,7 +239,7 @@ impl Synchronous<'_> {
     /// Faults of the server.
     pub fn round_trip(
         &mut self,
-        structures: &[&Geometry],
+        structures: &[&BondGeometry],
         cotangents: Option<&[&[f64]]>,
     ) -> Result<Vec<TestResult>, Fault> {
         let settings = self.setup.settings;
@@ -246,7 +247,7 @@ impl Synchronous<'_> {
         if let Some(cotangents) = cotangents {
             self.server.arenas[0].write_cotangents(cotangents.iter().map(|one| Some(*one)));
         }
-        let has_features = self.server.description.features.form != FeatureForm::None;
+        let has_features = self.server.description.features.form != AdapterFeatures::None;
         let evaluates = cotangents.is_none().then_some(has_features);
         let call = self.server.send(0, evaluates, settings)?;
         let generation = self.server.generation;
@@ -279,14 +280,14 @@ impl Synchronous<'_> {
 }
 
 impl Evaluate for Synchronous<'_> {
-    fn evaluate(&mut self, structures: &[&Geometry]) -> Result<Vec<TestResult>, String> {
+    fn evaluate(&mut self, structures: &[&BondGeometry]) -> Result<Vec<TestResult>, String> {
         let result = self.round_trip(structures, None);
         self.keep_fault(result)
     }
 
     fn pull_back(
         &mut self,
-        structures: &[&Geometry],
+        structures: &[&BondGeometry],
         cotangents: &[&[f64]],
     ) -> Result<Vec<TestResult>, String> {
         let result = self.round_trip(structures, Some(cotangents));

@@ -10,12 +10,12 @@ use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 use wire::DeviceStatistics;
 
-use crate::call::{Call, Geometry};
-use crate::description::FeatureForm;
+use crate::call::{BondGeometry, Call};
+use crate::description::AdapterFeatures;
 use crate::device::{CallError, DeviceError, DeviceInfo, Recipient};
 use crate::faults::Fault;
 use crate::process::ServerEvent;
-use crate::schedule::{Batch, Kind, Next, Schedule, Ticket};
+use crate::schedule::{DeviceBatch, Kind, Next, Schedule, Ticket};
 use crate::self_test::{self, TestSubject};
 use crate::server::{Outstanding, Server, ServerSetup, Synchronous};
 use crate::settings::PythonSettings;
@@ -32,13 +32,13 @@ const IDLE: Duration = Duration::from_secs(3600);
 
 /// What the thread waits for.
 #[derive(Debug)]
-pub(crate) enum Event {
+pub(crate) enum DeviceEvent {
     /// A client calls.
     Call { client: u64, call: Result<Call, String>, recipient: Recipient },
     /// A server has something to say.
     Server { generation: u64, event: ServerEvent },
     /// Evaluate copies of a structure in batches of all sizes, so that programs are compiled and memory is known.
-    WarmUp { geometry: Geometry, done: SyncSender<()> },
+    WarmUp { geometry: BondGeometry, done: SyncSender<()> },
     /// The device ends.
     Close,
 }
@@ -48,8 +48,8 @@ pub(crate) struct Worker {
     settings: PythonSettings,
     package: PathBuf,
     memory: PathBuf,
-    events: Sender<Event>,
-    incoming: Receiver<Event>,
+    events: Sender<DeviceEvent>,
+    incoming: Receiver<DeviceEvent>,
     statistics: Arc<Mutex<DeviceStatistics>>,
     stop: CancellationToken,
     broken: CancellationToken,
@@ -63,14 +63,14 @@ struct PendingCall {
 }
 
 enum Work {
-    Evaluate { geometry: Geometry, features: bool },
+    Evaluate { geometry: BondGeometry, features: bool },
     PullBack { cotangent: Vec<f64> },
 }
 
 /// A batch that the server has.
 struct SentBatch {
     call: Outstanding,
-    batch: Batch,
+    batch: DeviceBatch,
 }
 
 /// A result that is nonsense, until the reference structure tells whether that is the server's fault.
@@ -86,10 +86,10 @@ struct Running<'a> {
     server: Option<Server>,
     generation: u64,
     identity: String,
-    reference: (Geometry, Vec<f64>),
+    reference: (BondGeometry, Vec<f64>),
     schedule: Schedule,
     /// The last structure of each client.
-    clients: HashMap<u64, Geometry>,
+    clients: HashMap<u64, BondGeometry>,
     calls: HashMap<u64, PendingCall>,
     sent: VecDeque<SentBatch>,
     suspects: Vec<Suspect>,
@@ -106,7 +106,7 @@ impl Worker {
     pub fn new(
         settings: PythonSettings,
         (package, memory): (PathBuf, PathBuf),
-        (events, incoming): (Sender<Event>, Receiver<Event>),
+        (events, incoming): (Sender<DeviceEvent>, Receiver<DeviceEvent>),
         statistics: Arc<Mutex<DeviceStatistics>>,
         (stop, broken): (CancellationToken, CancellationToken),
     ) -> Self {
@@ -142,7 +142,7 @@ impl Worker {
     fn begin<'a>(
         &'a self,
         progress: &'a dyn Fn(&str),
-        early: &mut Vec<Event>,
+        early: &mut Vec<DeviceEvent>,
     ) -> Result<(Running<'a>, DeviceInfo), DeviceError> {
         progress(&format!("starting {}", self.settings.names()));
         let mut server = Server::start(&self.setup(), 0, &self.incoming, early).map_err(start_error)?;
@@ -160,8 +160,8 @@ impl Worker {
         }
         let elements = description.check().map_err(DeviceError::Server)?;
         let dimension = match description.features.form {
-            FeatureForm::None => 0,
-            FeatureForm::Raw | FeatureForm::Final => description.features.dimension,
+            AdapterFeatures::None => 0,
+            AdapterFeatures::Raw | AdapterFeatures::Final => description.features.dimension,
         };
         let epsilon = if description.precision == "double" { f64::EPSILON } else { f64::from(f32::EPSILON) };
         let subject = TestSubject { elements: &elements, cutoff: description.cutoff(), dimension, epsilon };
@@ -234,10 +234,10 @@ impl Running<'_> {
     }
 
     /// Returns whether the device goes on.
-    fn handle(&mut self, event: Event) -> bool {
+    fn handle(&mut self, event: DeviceEvent) -> bool {
         match event {
-            Event::Call { client, call, recipient } => self.accept(client, call, recipient),
-            Event::Server { generation, event } => {
+            DeviceEvent::Call { client, call, recipient } => self.accept(client, call, recipient),
+            DeviceEvent::Server { generation, event } => {
                 let is_current = self.server.as_ref().is_some_and(|server| server.is_of(generation));
                 match event {
                     _ if !is_current => {}
@@ -248,11 +248,11 @@ impl Running<'_> {
                     }
                 }
             }
-            Event::WarmUp { geometry, done } => {
+            DeviceEvent::WarmUp { geometry, done } => {
                 self.warm_up(&geometry);
                 let _ = done.send(());
             }
-            Event::Close => return false,
+            DeviceEvent::Close => return false,
         }
         true
     }
@@ -261,7 +261,7 @@ impl Running<'_> {
         if let Some(reason) = &self.given_up {
             return recipient.refuse(&CallError::Unavailable(reason.clone()));
         }
-        let known = self.clients.get(&client).map(Geometry::shape);
+        let known = self.clients.get(&client).map(BondGeometry::shape);
         let accepted = call.and_then(|call| match call {
             Call::Evaluate { geometry, features, pull_back_follows } => {
                 let kind = Kind::Evaluate { follows: pull_back_follows, features };
@@ -295,7 +295,7 @@ impl Running<'_> {
         None
     }
 
-    fn send(&mut self, batch: Batch) {
+    fn send(&mut self, batch: DeviceBatch) {
         let now = Instant::now();
         let waited: f64 = batch.tickets().iter().map(|one| now.duration_since(one.since).as_secs_f64()).sum();
         match self.write_and_send(&batch) {
@@ -311,7 +311,7 @@ impl Running<'_> {
         }
     }
 
-    fn write_and_send(&mut self, batch: &Batch) -> Result<Outstanding, Fault> {
+    fn write_and_send(&mut self, batch: &DeviceBatch) -> Result<Outstanding, Fault> {
         let Self { server, calls, clients, reference, worker, .. } = self;
         let server = server.as_mut().ok_or(Fault::Stopped)?;
         let settings = &worker.settings;
@@ -324,17 +324,17 @@ impl Running<'_> {
             _ => None,
         };
         match batch {
-            Batch::Evaluate { slot, tickets } => {
+            DeviceBatch::Evaluate { slot, tickets } => {
                 server.write(*slot, &tickets.iter().map(geometry).collect::<Vec<_>>())?;
                 let wants = |one: &Ticket| matches!(one.kind, Kind::Evaluate { features: true, .. });
                 server.send(*slot, Some(tickets.iter().any(wants)), settings)
             }
-            Batch::PullBackKept { slot, tickets } => {
+            DeviceBatch::PullBackKept { slot, tickets } => {
                 server.arenas[*slot]
                     .write_cotangents(tickets.iter().map(|one| one.as_ref().and_then(cotangent)));
                 server.send(*slot, None, settings)
             }
-            Batch::PullBackAnew { slot, tickets } => {
+            DeviceBatch::PullBackAnew { slot, tickets } => {
                 server.write(*slot, &tickets.iter().map(geometry).collect::<Vec<_>>())?;
                 server.arenas[*slot].write_cotangents(tickets.iter().map(cotangent));
                 server.send(*slot, None, settings)
@@ -364,12 +364,12 @@ impl Running<'_> {
     }
 
     /// Hands out the results of a batch.
-    fn deliver(&mut self, call: &Outstanding, batch: &Batch) {
+    fn deliver(&mut self, call: &Outstanding, batch: &DeviceBatch) {
         let members: Vec<Option<Ticket>> = match batch {
-            Batch::Evaluate { tickets, .. } | Batch::PullBackAnew { tickets, .. } => {
+            DeviceBatch::Evaluate { tickets, .. } | DeviceBatch::PullBackAnew { tickets, .. } => {
                 tickets.iter().copied().map(Some).collect()
             }
-            Batch::PullBackKept { tickets, .. } => tickets.clone(),
+            DeviceBatch::PullBackKept { tickets, .. } => tickets.clone(),
         };
         for (place, ticket) in members.into_iter().enumerate() {
             let Some(ticket) = ticket else { continue };
@@ -451,7 +451,7 @@ impl Running<'_> {
         }
     }
 
-    fn handle_fault(&mut self, fault: Fault, batch: Batch) {
+    fn handle_fault(&mut self, fault: Fault, batch: DeviceBatch) {
         let tickets = batch.tickets();
         let bonds: usize = tickets.iter().map(|one| one.shape.bonds).sum();
         match fault {
@@ -558,11 +558,11 @@ impl Running<'_> {
     }
 
     /// Evaluates batches of one, two, four … copies, so that their programs are compiled, and finds how many fit into the memory.
-    fn warm_up(&mut self, geometry: &Geometry) {
+    fn warm_up(&mut self, geometry: &BondGeometry) {
         let worker = self.worker;
         let setup = worker.setup();
         let Some(server) = self.server.as_mut().filter(|_| self.sent.is_empty()) else { return };
-        let has_features = server.description.features.form != FeatureForm::None;
+        let has_features = server.description.features.form != AdapterFeatures::None;
         let dimension = if has_features { server.description.features.dimension } else { 0 };
         let cotangent = vec![0.0; geometry.positions.len() * dimension];
         let mut early = Vec::new();
@@ -609,7 +609,7 @@ impl Running<'_> {
         change(&mut self.worker.statistics.lock().unwrap_or_else(PoisonError::into_inner));
     }
 
-    fn count(&mut self, call: &Outstanding, batch: &Batch, compiled: bool, now: Instant) {
+    fn count(&mut self, call: &Outstanding, batch: &DeviceBatch, compiled: bool, now: Instant) {
         let tickets = batch.tickets();
         let bonds: usize = tickets.iter().map(|one| one.shape.bonds).sum();
         let seconds = now.duration_since(call.sent).as_secs_f64();
