@@ -131,7 +131,10 @@ fn all_errors_are_reported_together() {
     let lines: Vec<_> = message.lines().filter(|line| line.starts_with("c.toml:")).collect();
     let expected = [
         ("rng_seed", "campaign.rng_seed: invalid value: integer `-1`"),
-        ("modle", "unknown key `modle`, expected `model` or `precision`; did you mean `model`?"),
+        (
+            "modle",
+            "unknown key `modle`, expected one of `model`, `precision`, `python`; did you mean `model`?",
+        ),
         ("[walk]", "missing key `tau`"),
         ("temprature", "unknown key `temprature`, expected one of"),
         ("to = 140", "walk.volume_ramp.to is 140; expected"),
