@@ -99,7 +99,7 @@ fn faults_of_the_server_change_nothing() {
     assert!(faults >= FAULTS, "the campaign was over after {faults} faults");
     let (plain, disturbed) = (export(here, "plain"), export(here, "disturbed"));
     assert!(plain == disturbed, "{} and {} bytes", plain.len(), disturbed.len());
-    let status = succeed(here, ["status", "disturbed"]);
+    let status = succeed(here, ["status", "--all", "disturbed"]);
     assert!(status.contains("simulated on cpu") && status.contains("restart"), "{status}");
 }
 
