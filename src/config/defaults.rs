@@ -140,7 +140,7 @@ pub fn refit_attempts() -> NonZeroU32 {
 }
 
 pub fn python_device() -> String {
-    bridge::PythonDevice::default().0
+    "cpu".to_owned()
 }
 
 pub fn max_batch() -> NonZeroU32 {

@@ -3,7 +3,7 @@
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 
-use bridge::{PythonDevice, PythonSettings};
+use bridge::PythonSettings;
 use potentials::grace::Precision;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -17,7 +17,7 @@ use crate::duration::Duration;
 pub struct PythonSection {
     /// Directory of the virtual or conda environment with the model's framework, or a Python program.
     pub environment: PathBuf,
-    /// Words before the Python program, for instance `["apptainer", "exec", "mace.sif"]`. Default: none.
+    /// Words before the Python program, for instance `["apptainer", "exec", "mace.sif"]`; `environment` is then the program inside. Default: none.
     #[serde(default)]
     pub launcher: Vec<String>,
     /// Adapter that evaluates the model: `gracemaker`, `mace`, `ase`, or your own as `file.py:Class` or `module:Class`.
@@ -56,7 +56,7 @@ impl PythonSection {
             adapter: self.adapter.clone(),
             model: Some(absolute(model)),
             options: self.options.clone(),
-            device: PythonDevice(self.device.clone()),
+            device: self.device.clone(),
             precision,
             threads: self.threads,
             max_batch: self.max_batch,

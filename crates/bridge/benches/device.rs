@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use atoms::{Cell, Evaluation, NeighbourList, Species, Structure};
-use bridge::{Device, DeviceService, PythonDevice, PythonModel, PythonSettings};
+use bridge::{Device, DeviceService, PythonModel, PythonSettings};
 use calm::build::random_projection;
 use potentials::grace::{PullBack, Threads};
 use potentials::{ModelWithFeatures, PotentialWithFeatures};
@@ -29,8 +29,8 @@ fn main() {
         (std::env::var_os("CALMWALK_MODEL"), std::env::var("CALMWALK_ADAPTER"))
     {
         let mut settings = PythonSettings::new(&python, &adapter, Some(Path::new(&model)));
-        settings.device = PythonDevice(std::env::var("CALMWALK_DEVICE").unwrap_or_else(|_| "cpu".to_owned()));
-        println!("\n{adapter} on {}, biased steps of 108 atoms", settings.device.0);
+        settings.device = std::env::var("CALMWALK_DEVICE").unwrap_or_else(|_| "cpu".to_owned());
+        println!("\n{adapter} on {}, biased steps of 108 atoms", settings.device);
         let walkers = std::env::var("CALMWALK_WALKERS").ok().and_then(|text| text.parse().ok()).unwrap_or(64);
         compare(&settings, walkers, 3, Duration::from_secs(20));
     }
@@ -99,7 +99,7 @@ fn compare(settings: &PythonSettings, walkers: usize, repeats: usize, time: Dura
         settings.max_batch = max_batch.try_into().expect("above zero");
         let device = start(settings);
         let model = projected(PythonModel::local(Arc::clone(&device)).expect("a model"));
-        let _ = device.warm_up(&model, &crystal(repeats, 0), 0.5);
+        let _ = device.warm_up(&crystal(repeats, 0), 0.5, walkers);
         let before = device.statistics();
         let end = Instant::now() + time;
         let begun = Instant::now();

@@ -1,79 +1,22 @@
 //! A device with a model: one server for all walkers of a host.
 
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{self, Sender, SyncSender};
+use std::sync::mpsc::{self, Sender};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 
-use atoms::{NeighbourList, Structure};
-use potentials::ModelWithFeatures;
+use atoms::{NeighbourList, Species, Structure};
 use tempfile::TempDir;
 use tokio_util::sync::CancellationToken;
 use wire::DeviceStatistics;
-use wire::ipc::IncomingCall;
 
 use crate::call::{BondGeometry, Call, Topology};
-use crate::description::ModelDescription;
-use crate::model::PythonModel;
-use crate::self_test::{SelfTestError, SelfTestReport};
+use crate::error::{CallError, DeviceError};
+use crate::events::DeviceEvent;
+use crate::recipient::Recipient;
 use crate::settings::PythonSettings;
-use crate::worker::{DeviceEvent, Worker};
-
-/// Why a device cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum DeviceError {
-    /// The server does not start, or does not answer.
-    #[error("{0}")]
-    Server(String),
-    /// The model's derivatives are wrong.
-    #[error("{names}: {source}")]
-    SelfTest {
-        /// Adapter and environment.
-        names: String,
-        /// What is wrong.
-        source: SelfTestError,
-    },
-    /// A file or directory cannot be written.
-    #[error("cannot write {path}: {source}")]
-    File {
-        /// Where.
-        path: String,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// The program was asked to stop.
-    #[error("interrupted while the server of the model was started")]
-    Stopped,
-}
-
-/// Why a call has no result.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum CallError {
-    /// The device is not there any more.
-    #[error("{0}")]
-    Unavailable(String),
-    /// The model cannot evaluate this structure.
-    #[error("{0}")]
-    Failed(String),
-}
-
-/// Who gets the result of a call.
-#[derive(Debug)]
-pub(crate) enum Recipient {
-    /// A thread of this process.
-    Channel(SyncSender<Result<Vec<f64>, CallError>>),
-    /// Another process.
-    Shared(IncomingCall),
-}
-
-/// What a device tells of itself when it is ready.
-#[derive(Clone, Debug)]
-pub struct DeviceInfo {
-    /// The model.
-    pub description: ModelDescription,
-    /// The figures of the self-test.
-    pub self_test: SelfTestReport,
-}
+use crate::setup::DeviceSetup;
+use crate::worker::{self, DeviceInfo};
 
 /// A running device. Dropping it ends its server.
 #[derive(Debug)]
@@ -119,16 +62,19 @@ impl Device {
         let (events, incoming) = mpsc::channel();
         let (ready, started) = mpsc::sync_channel(1);
         let package = write_package()?;
-        let worker = Worker::new(
+        let setup = DeviceSetup {
             settings,
-            (package.path().to_owned(), memory()),
-            (events.clone(), incoming),
-            Arc::clone(&statistics),
-            (stop.clone(), broken.clone()),
-        );
+            package: package.path().to_owned(),
+            memory: memory(),
+            events: events.clone(),
+            incoming,
+            statistics: Arc::clone(&statistics),
+            stop: stop.clone(),
+            broken: broken.clone(),
+        };
         let thread = thread::Builder::new()
             .name("python-device".to_owned())
-            .spawn(move || worker.run(&progress, &ready))
+            .spawn(move || worker::run(&setup, &progress, &ready))
             .map_err(|error| DeviceError::Server(format!("cannot start a thread: {error}")))?;
         let info = started
             .recv()
@@ -159,18 +105,23 @@ impl Device {
         &self.broken
     }
 
-    /// Evaluates copies of a structure in batches of one, two, four, … of them: frameworks compile, and it is found how many the memory of
-    /// the device takes. Of use for devices other than a processor, and for frameworks that compile.
+    /// Evaluates copies of a structure in batches of one, two, four, … of them, up to `most`: frameworks compile, and it is found how many
+    /// the memory of the device takes. Of use for devices other than a processor, and for frameworks that compile.
     ///
     /// # Errors
     /// An element that the model does not support, or an invalid structure.
-    pub fn warm_up(&self, model: &PythonModel, structure: &Structure, skin: f64) -> Result<(), String> {
-        let species = model.element_indices(&structure.species).map_err(|error| error.to_string())?;
-        let mut list = NeighbourList::new(model.description().cutoff(), skin);
+    pub fn warm_up(&self, structure: &Structure, skin: f64, most: usize) -> Result<(), String> {
+        let description = &self.info.description;
+        let index = |species: &Species| {
+            let known = description.elements.iter().position(|symbol| symbol == species.symbol());
+            known.ok_or_else(|| format!("the model does not support {species}"))
+        };
+        let species = structure.species.iter().map(index).collect::<Result<Vec<_>, _>>()?;
+        let mut list = NeighbourList::new(description.cutoff(), skin);
         list.update(structure).map_err(|error| error.to_string())?;
         let geometry = BondGeometry::of(structure, Topology::of(&species, &list, None));
         let (done, ended) = mpsc::sync_channel(1);
-        if self.events.send(DeviceEvent::WarmUp { geometry, done }).is_ok() {
+        if self.events.send(DeviceEvent::WarmUp { geometry, most, done }).is_ok() {
             // The thread may have crashed.
             let _ = ended.recv();
         }
@@ -203,52 +154,6 @@ impl Drop for Device {
         let _ = self.events.send(DeviceEvent::Close);
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
-        }
-    }
-}
-
-/// First word of an answer in shared memory.
-pub(crate) mod status {
-    pub const OK: u64 = 0;
-    pub const UNAVAILABLE: u64 = 1;
-    pub const FAILED: u64 = 2;
-}
-
-impl Recipient {
-    /// Gives the recipient `length` numbers, which `write` writes.
-    pub fn answer(self, length: usize, write: impl FnOnce(&mut [f64])) {
-        match self {
-            Self::Channel(sender) => {
-                let mut numbers = vec![0.0; length];
-                write(&mut numbers);
-                let _ = sender.send(Ok(numbers));
-            }
-            Self::Shared(call) => call.answer(1 + length, |words| {
-                words[0] = status::OK;
-                write(bytemuck::cast_slice_mut(&mut words[1..]));
-            }),
-        }
-    }
-
-    /// Gives the recipient an error.
-    pub fn refuse(self, error: &CallError) {
-        match self {
-            Self::Channel(sender) => {
-                let _ = sender.send(Err(error.clone()));
-            }
-            Self::Shared(call) => {
-                let (status, message) = match error {
-                    CallError::Unavailable(message) => (status::UNAVAILABLE, message),
-                    CallError::Failed(message) => (status::FAILED, message),
-                };
-                let bytes = message.as_bytes();
-                call.answer(2 + bytes.len().div_ceil(8), |words| {
-                    words.fill(0);
-                    (words[0], words[1]) = (status, bytes.len() as u64);
-                    bytemuck::cast_slice_mut::<u64, u8>(&mut words[2..])[..bytes.len()]
-                        .copy_from_slice(bytes);
-                });
-            }
         }
     }
 }

@@ -155,8 +155,8 @@ impl Schedule {
     }
 
     /// Puts calls back in front of all others, for another try.
-    pub fn put_back(&mut self, tickets: impl DoubleEndedIterator<Item = Ticket>) {
-        tickets.rev().for_each(|ticket| self.waiting.push_front(ticket));
+    pub fn put_back(&mut self, tickets: Vec<Ticket>) {
+        tickets.into_iter().rev().for_each(|ticket| self.waiting.push_front(ticket));
     }
 
     /// The server has answered its oldest batch. Clients of an evaluation may call for pull-backs from now on.
@@ -190,7 +190,7 @@ impl Schedule {
         self.waiting.retain(|ticket| ticket.id != dropped);
         for slot in std::mem::take(&mut self.slots) {
             if let SlotState::Kept { arrived, .. } = slot {
-                self.put_back(arrived.into_iter().flatten());
+                self.put_back(arrived.into_iter().flatten().collect());
             }
         }
     }

@@ -1,23 +1,22 @@
 //! A server and its arenas: one batch after the other, with deadlines.
 
 use std::collections::HashSet;
-use std::path::Path;
-use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
+use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
 use potentials::grace::Precision;
 use serde_json::json;
-use tokio_util::sync::CancellationToken;
 
 use crate::batch::{BatchArena, BatchKind};
 use crate::call::BondGeometry;
 use crate::description::{AdapterFeatures, ModelDescription, PROTOCOL};
+use crate::events::DeviceEvent;
 use crate::faults::{Fault, Reply};
 use crate::process::{ServerEvent, ServerProcess};
 use crate::self_test::{Evaluate, TestResult};
 use crate::settings::PythonSettings;
+use crate::setup::DeviceSetup;
 use crate::shapes::Shape;
-use crate::worker::DeviceEvent;
 
 /// Interval at which a synchronous call looks whether the device was asked to stop.
 const LOOK_AROUND: Duration = Duration::from_millis(200);
@@ -45,31 +44,15 @@ pub(crate) struct Server {
     evaluations: [Option<u64>; 2],
 }
 
-/// What is needed to start servers.
-pub(crate) struct ServerSetup<'a> {
-    pub settings: &'a PythonSettings,
-    /// Where the package is.
-    pub package: &'a Path,
-    /// Where arenas are made.
-    pub memory: &'a Path,
-    pub events: &'a Sender<DeviceEvent>,
-    pub stop: &'a CancellationToken,
-}
-
 impl Server {
     /// Starts a server and says hello. Events of earlier servers are dropped; calls that come meanwhile go to `early`.
     ///
     /// # Errors
     /// Why there is none.
-    pub fn start(
-        setup: &ServerSetup<'_>,
-        generation: u64,
-        incoming: &Receiver<DeviceEvent>,
-        early: &mut Vec<DeviceEvent>,
-    ) -> Result<Self, Fault> {
-        let settings = setup.settings;
+    pub fn start(setup: &DeviceSetup, generation: u64, early: &mut Vec<DeviceEvent>) -> Result<Self, Fault> {
+        let settings = &setup.settings;
         let tag = move |event| DeviceEvent::Server { generation, event };
-        let mut process = ServerProcess::start(settings, setup.package, setup.events.clone(), tag)
+        let mut process = ServerProcess::start(settings, &setup.package, setup.events.clone(), tag)
             .map_err(Fault::Exited)?;
         let precision = match settings.precision {
             Precision::Double => "double",
@@ -77,11 +60,11 @@ impl Server {
         };
         let hello = json!({
             "call": "hello", "protocol": PROTOCOL, "adapter": settings.adapter, "model": settings.model, "options": settings.options,
-            "device": settings.device.0, "precision": precision, "threads": settings.threads, "cache": settings.cache,
+            "device": settings.device, "precision": precision, "threads": settings.threads, "cache": settings.cache,
         });
         let sent = process.send(&hello.to_string());
         let deadline = Instant::now() + settings.compile_timeout;
-        let wait = Wait { setup, generation, incoming, early };
+        let wait = Wait { setup, generation, early };
         let line = sent
             .map_err(|error| Fault::Exited(format!("{}: {error}", settings.names())))
             .and_then(|()| wait.line(deadline, "hello"));
@@ -99,7 +82,7 @@ impl Server {
                     AdapterFeatures::None => 0,
                     _ => description.features.dimension,
                 };
-                let arenas = [0, 1].map(|number| BatchArena::new(setup.memory, number, dimension));
+                let arenas = [0, 1].map(|number| BatchArena::new(&setup.memory, number, dimension));
                 let (known_shapes, evaluations) = (HashSet::new(), [None; 2]);
                 Ok(Self { process, generation, description, arenas, known_shapes, next_id: 1, evaluations })
             }
@@ -185,9 +168,8 @@ fn with_end(fault: Fault, process: ServerProcess) -> Fault {
 
 /// Waits for a line of a server, and keeps other events.
 pub(crate) struct Wait<'a> {
-    pub setup: &'a ServerSetup<'a>,
+    pub setup: &'a DeviceSetup,
     pub generation: u64,
-    pub incoming: &'a Receiver<DeviceEvent>,
     pub early: &'a mut Vec<DeviceEvent>,
 }
 
@@ -206,7 +188,7 @@ impl Wait<'_> {
             if left.is_zero() {
                 return Err(Fault::Timeout(format!("{names}, {call}: no answer in time")));
             }
-            match self.incoming.recv_timeout(left.min(LOOK_AROUND)) {
+            match self.setup.incoming.recv_timeout(left.min(LOOK_AROUND)) {
                 Ok(DeviceEvent::Server { generation, event }) if generation == self.generation => match event
                 {
                     ServerEvent::Line(line) => return Ok(line),
@@ -225,8 +207,7 @@ impl Wait<'_> {
 /// Synchronous calls, for the self-test and to warm up.
 pub(crate) struct Synchronous<'a> {
     pub server: &'a mut Server,
-    pub setup: &'a ServerSetup<'a>,
-    pub incoming: &'a Receiver<DeviceEvent>,
+    pub setup: &'a DeviceSetup,
     pub early: &'a mut Vec<DeviceEvent>,
     /// The last fault, as the test knows messages only.
     pub fault: Option<Fault>,
@@ -242,7 +223,7 @@ impl Synchronous<'_> {
         structures: &[&BondGeometry],
         cotangents: Option<&[&[f64]]>,
     ) -> Result<Vec<TestResult>, Fault> {
-        let settings = self.setup.settings;
+        let settings = &self.setup.settings;
         self.server.write(0, structures)?;
         if let Some(cotangents) = cotangents {
             self.server.arenas[0].write_cotangents(cotangents.iter().map(|one| Some(*one)));
@@ -251,7 +232,7 @@ impl Synchronous<'_> {
         let evaluates = cotangents.is_none().then_some(has_features);
         let call = self.server.send(0, evaluates, settings)?;
         let generation = self.server.generation;
-        let wait = Wait { setup: self.setup, generation, incoming: self.incoming, early: self.early };
+        let wait = Wait { setup: self.setup, generation, early: self.early };
         let what = if evaluates.is_some() { "evaluate" } else { "pull_back" };
         let line = wait.line(call.deadline, what)?;
         self.server.answer(&line, &call, &settings.names())?;

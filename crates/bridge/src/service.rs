@@ -10,7 +10,8 @@ use wire::ipc::{CallAddress, CallServer, IpcError};
 use wire::shm_dir::ShmDir;
 
 use crate::call::{self, Call, Topology};
-use crate::device::{Device, Recipient};
+use crate::device::Device;
+use crate::recipient::Recipient;
 
 /// Takes calls of other processes. Dropping it ends that, but not the device.
 #[derive(Debug)]

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 pub struct PythonSettings {
     /// Directory of a virtual environment or of a conda environment (with `bin/python`), or a Python program.
     pub environment: PathBuf,
-    /// Words before the Python program, for instance `apptainer exec image.sif`.
+    /// Words before the Python program, for instance `apptainer exec image.sif`; `environment` is then the program inside.
     pub launcher: Vec<String>,
     /// An adapter of the package, or one of the user: `module:Class` or `file.py:Class`.
     pub adapter: String,
@@ -22,7 +22,7 @@ pub struct PythonSettings {
     /// Further settings of the adapter.
     pub options: serde_json::Map<String, serde_json::Value>,
     /// Where the model is evaluated.
-    pub device: PythonDevice,
+    pub device: String,
     /// Precision of the model.
     pub precision: Precision,
     /// Processor threads of the server.
@@ -37,17 +37,6 @@ pub struct PythonSettings {
     pub cache: Option<PathBuf>,
 }
 
-/// The device on which a model is evaluated.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(transparent)]
-pub struct PythonDevice(pub String);
-
-impl Default for PythonDevice {
-    fn default() -> Self {
-        Self("cpu".to_owned())
-    }
-}
-
 impl PythonSettings {
     /// The usual settings of an adapter.
     pub fn new(environment: &Path, adapter: &str, model: Option<&Path>) -> Self {
@@ -57,7 +46,7 @@ impl PythonSettings {
             adapter: adapter.to_owned(),
             model: model.map(Path::to_owned),
             options: serde_json::Map::new(),
-            device: PythonDevice::default(),
+            device: "cpu".to_owned(),
             precision: Precision::default(),
             threads: NonZeroU32::MIN,
             max_batch: NonZeroU32::new(32).unwrap_or(NonZeroU32::MIN),
@@ -67,10 +56,10 @@ impl PythonSettings {
         }
     }
 
-    /// The Python program.
+    /// The Python program. Behind a launcher, only that knows what the environment is.
     pub(crate) fn program(&self) -> PathBuf {
-        let inside = self.environment.join("bin/python");
-        if self.environment.is_dir() || inside.exists() { inside } else { self.environment.clone() }
+        let is_directory = self.launcher.is_empty() && self.environment.is_dir();
+        if is_directory { self.environment.join("bin/python") } else { self.environment.clone() }
     }
 
     /// Names adapter and environment, for errors.

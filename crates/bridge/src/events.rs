@@ -1,0 +1,20 @@
+//! What a device's thread waits for.
+
+use std::sync::mpsc::SyncSender;
+
+use crate::call::{BondGeometry, Call};
+use crate::process::ServerEvent;
+use crate::recipient::Recipient;
+
+/// An event of a device.
+#[derive(Debug)]
+pub(crate) enum DeviceEvent {
+    /// A client calls.
+    Call { client: u64, call: Result<Call, String>, recipient: Recipient },
+    /// A server has something to say.
+    Server { generation: u64, event: ServerEvent },
+    /// Evaluate copies of a structure in batches of all sizes, so that programs are compiled and memory is known.
+    WarmUp { geometry: BondGeometry, most: usize, done: SyncSender<()> },
+    /// The device ends.
+    Close,
+}

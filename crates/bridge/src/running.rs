@@ -1,0 +1,341 @@
+//! The thread of a device while its server runs: takes calls, sends batches, and hands out results.
+
+use std::collections::{HashMap, HashSet, VecDeque};
+use std::sync::mpsc::RecvTimeoutError;
+use std::time::{Duration, Instant};
+
+use tracing::{info, warn};
+
+use crate::call::{BondGeometry, Call};
+use crate::description::AdapterFeatures;
+use crate::error::CallError;
+use crate::events::DeviceEvent;
+use crate::faults::Fault;
+use crate::process::ServerEvent;
+use crate::recipient::Recipient;
+use crate::schedule::{DeviceBatch, Kind, Next, Schedule, Ticket};
+use crate::server::{Outstanding, Server, Synchronous};
+use crate::setup::DeviceSetup;
+use crate::shapes::Shape;
+
+/// The call of the reference structure.
+pub(crate) const REFERENCE: u64 = 0;
+/// Time without any event.
+const IDLE: Duration = Duration::from_secs(3600);
+
+/// A call without result.
+pub(crate) struct PendingCall {
+    pub client: u64,
+    pub work: Work,
+    pub recipient: Recipient,
+}
+
+/// What a call asks for.
+pub(crate) enum Work {
+    Evaluate { geometry: BondGeometry, features: bool },
+    PullBack { cotangent: Vec<f64> },
+}
+
+/// A batch that the server has.
+pub(crate) struct SentBatch {
+    pub call: Outstanding,
+    pub batch: DeviceBatch,
+}
+
+/// A result that is nonsense, until the reference structure tells whether that is the server's fault.
+pub(crate) struct Suspect {
+    pub ticket: Ticket,
+    pub outcome: Result<Vec<f64>, String>,
+}
+
+/// The thread while its server runs.
+pub(crate) struct Running<'a> {
+    pub setup: &'a DeviceSetup,
+    pub progress: &'a dyn Fn(&str),
+    pub server: Option<Server>,
+    pub generation: u64,
+    pub identity: String,
+    pub reference: (BondGeometry, Vec<f64>),
+    pub schedule: Schedule,
+    /// The last structure of each client.
+    pub clients: HashMap<u64, BondGeometry>,
+    pub calls: HashMap<u64, PendingCall>,
+    pub sent: VecDeque<SentBatch>,
+    pub suspects: Vec<Suspect>,
+    /// Calls that a failure has interrupted.
+    pub interrupted: HashSet<u64>,
+    pub failures: u32,
+    pub next_id: u64,
+    pub busy_since: Option<Instant>,
+    pub started: Instant,
+    pub given_up: Option<String>,
+}
+
+impl Running<'_> {
+    /// Works until the device is closed.
+    pub fn run(&mut self) {
+        loop {
+            let next = self.dispatch();
+            let deadline = self.sent.front().map(|sent| sent.call.deadline);
+            let until = [next, deadline].into_iter().flatten().min();
+            let timeout = until.map_or(IDLE, |until| until.saturating_duration_since(Instant::now()));
+            let is_open = match self.setup.incoming.recv_timeout(timeout) {
+                Ok(event) => self.handle(event),
+                Err(RecvTimeoutError::Timeout) => true,
+                Err(RecvTimeoutError::Disconnected) => false,
+            };
+            self.check_deadline();
+            self.note_time();
+            if !is_open {
+                self.give_up("the device has ended");
+                return;
+            }
+        }
+    }
+
+    /// Returns whether the device goes on.
+    pub fn handle(&mut self, event: DeviceEvent) -> bool {
+        match event {
+            DeviceEvent::Call { client, call, recipient } => self.accept(client, call, recipient),
+            DeviceEvent::Server { generation, event } => {
+                let is_current = self.server.as_ref().is_some_and(|server| server.is_of(generation));
+                match event {
+                    _ if !is_current => {}
+                    ServerEvent::Line(line) => self.take_answer(&line),
+                    ServerEvent::Ended => {
+                        let names = self.setup.settings.names();
+                        self.restart(Fault::Exited(format!("{names}: the server has exited")));
+                    }
+                }
+            }
+            DeviceEvent::WarmUp { geometry, most, done } => {
+                self.warm_up(&geometry, most);
+                let _ = done.send(());
+            }
+            DeviceEvent::Close => return false,
+        }
+        true
+    }
+
+    fn accept(&mut self, client: u64, call: Result<Call, String>, recipient: Recipient) {
+        if let Some(reason) = &self.given_up {
+            return recipient.refuse(&CallError::Unavailable(reason.clone()));
+        }
+        let known = self.clients.get(&client).map(BondGeometry::shape);
+        let accepted = call.and_then(|call| match call {
+            Call::Evaluate { geometry, features, pull_back_follows } => {
+                let kind = Kind::Evaluate { follows: pull_back_follows, features };
+                Ok((geometry.shape(), kind, Work::Evaluate { geometry, features }))
+            }
+            Call::PullBack { cotangent } => match known {
+                Some(shape) => Ok((shape, Kind::PullBack, Work::PullBack { cotangent })),
+                None => Err("a pull-back before the first evaluation".to_owned()),
+            },
+        });
+        match accepted {
+            Err(error) => recipient.refuse(&CallError::Failed(error)),
+            Ok((shape, kind, work)) => {
+                let id = self.next_id;
+                self.next_id += 1;
+                self.calls.insert(id, PendingCall { client, work, recipient });
+                self.schedule.add(Ticket { id, client, kind, shape, since: Instant::now(), alone: false });
+            }
+        }
+    }
+
+    /// Sends what can be sent. Returns when there may be more.
+    fn dispatch(&mut self) -> Option<Instant> {
+        while self.server.is_some() {
+            match self.schedule.next(Instant::now()) {
+                Next::Send(batch) => self.send(batch),
+                Next::WaitUntil(time) => return Some(time),
+                Next::Wait => return None,
+            }
+        }
+        None
+    }
+
+    fn send(&mut self, batch: DeviceBatch) {
+        let now = Instant::now();
+        let waited: f64 = batch.tickets().iter().map(|one| now.duration_since(one.since).as_secs_f64()).sum();
+        match self.write_and_send(&batch) {
+            Ok(call) => {
+                self.sent.push_back(SentBatch { call, batch });
+                self.busy_since.get_or_insert(now);
+                self.setup.note(|statistics| statistics.waited += waited);
+            }
+            Err(fault) => {
+                self.schedule.abort_newest();
+                self.handle_fault(fault, batch);
+            }
+        }
+    }
+
+    fn write_and_send(&mut self, batch: &DeviceBatch) -> Result<Outstanding, Fault> {
+        let Self { server, calls, clients, reference, setup, .. } = self;
+        let server = server.as_mut().ok_or(Fault::Stopped)?;
+        let settings = &setup.settings;
+        let geometry = |ticket: &Ticket| match calls.get(&ticket.id).map(|call| &call.work) {
+            Some(Work::Evaluate { geometry, .. }) => geometry,
+            _ => clients.get(&ticket.client).unwrap_or(&reference.0),
+        };
+        let cotangent = |ticket: &Ticket| match calls.get(&ticket.id).map(|call| &call.work) {
+            Some(Work::PullBack { cotangent }) => Some(&cotangent[..]),
+            _ => None,
+        };
+        match batch {
+            DeviceBatch::Evaluate { slot, tickets } => {
+                server.write(*slot, &tickets.iter().map(geometry).collect::<Vec<_>>())?;
+                let wants = |one: &Ticket| matches!(one.kind, Kind::Evaluate { features: true, .. });
+                server.send(*slot, Some(tickets.iter().any(wants)), settings)
+            }
+            DeviceBatch::PullBackKept { slot, tickets } => {
+                server.arenas[*slot]
+                    .write_cotangents(tickets.iter().map(|one| one.as_ref().and_then(cotangent)));
+                server.send(*slot, None, settings)
+            }
+            DeviceBatch::PullBackAnew { slot, tickets } => {
+                server.write(*slot, &tickets.iter().map(geometry).collect::<Vec<_>>())?;
+                server.arenas[*slot].write_cotangents(tickets.iter().map(cotangent));
+                server.send(*slot, None, settings)
+            }
+        }
+    }
+
+    fn take_answer(&mut self, line: &str) {
+        let names = self.setup.settings.names();
+        let Some(SentBatch { call, batch }) = self.sent.pop_front() else {
+            return self.restart(Fault::Nonsense(format!("{names}: an answer without a call")));
+        };
+        let Some(server) = &mut self.server else { return };
+        match server.answer(line, &call, &names) {
+            Ok((compiled, seconds)) => {
+                let now = Instant::now();
+                self.schedule.done(now);
+                self.setup.note(|statistics| statistics.computed += seconds);
+                self.count(&call, &batch, compiled, now);
+                self.deliver(&call, &batch);
+            }
+            Err(fault) => {
+                self.schedule.abort_oldest();
+                self.handle_fault(fault, batch);
+            }
+        }
+    }
+
+    /// Hands out the results of a batch.
+    fn deliver(&mut self, call: &Outstanding, batch: &DeviceBatch) {
+        let members: Vec<Option<Ticket>> = match batch {
+            DeviceBatch::Evaluate { tickets, .. } | DeviceBatch::PullBackAnew { tickets, .. } => {
+                tickets.iter().copied().map(Some).collect()
+            }
+            DeviceBatch::PullBackKept { tickets, .. } => tickets.clone(),
+        };
+        for (place, ticket) in members.into_iter().enumerate() {
+            let Some(ticket) = ticket else { continue };
+            let Some(server) = &mut self.server else { return };
+            let mut parts = server.arenas[call.slot].result(place, call.kind);
+            if ticket.id == REFERENCE {
+                let energies = parts.energies.to_vec();
+                self.judge(&energies);
+                continue;
+            }
+            if let Some(Work::Evaluate { features: false, .. }) =
+                self.calls.get(&ticket.id).map(|call| &call.work)
+            {
+                parts.features = &[];
+            }
+            if let Some(what) = parts.not_finite() {
+                let mut numbers = vec![0.0; parts.len()];
+                parts.write(&mut numbers);
+                warn!(what, client = ticket.client, "nonsense from the python server");
+                self.suspect(ticket, Ok(numbers));
+                continue;
+            }
+            self.interrupted.remove(&ticket.id);
+            if let Some(call) = self.calls.remove(&ticket.id) {
+                call.recipient.answer(parts.len(), |out| parts.write(out));
+                if let Work::Evaluate { geometry, .. } = call.work {
+                    self.clients.insert(call.client, geometry);
+                }
+            }
+        }
+        if self.interrupted.is_empty() && self.suspects.is_empty() {
+            self.failures = 0;
+        }
+    }
+
+    fn check_deadline(&mut self) {
+        let is_over = |sent: &SentBatch| sent.call.deadline <= Instant::now();
+        if let Some(sent) = self.sent.front().filter(|sent| is_over(sent)) {
+            let seconds = (sent.call.deadline - sent.call.sent).as_secs();
+            let names = self.setup.settings.names();
+            self.restart(Fault::Timeout(format!("{names}: no answer for {seconds} s")));
+        }
+    }
+
+    /// Evaluates batches of one, two, four … copies, so that their programs are compiled, and finds how many fit into the memory.
+    fn warm_up(&mut self, geometry: &BondGeometry, most: usize) {
+        let Some(server) = self.server.as_mut().filter(|_| self.sent.is_empty()) else { return };
+        let has_features = server.description.features.form != AdapterFeatures::None;
+        let dimension = if has_features { server.description.features.dimension } else { 0 };
+        let cotangent = vec![0.0; geometry.positions.len() * dimension];
+        let mut early = Vec::new();
+        let mut fault = None;
+        let mut copies = 1;
+        while copies <= most.min(self.schedule.max_structures()) {
+            (self.progress)(&format!("preparing batches of {copies}"));
+            let structures = vec![geometry; copies];
+            let mut calls = Synchronous { server, setup: self.setup, early: &mut early, fault: None };
+            let made = calls.round_trip(&structures, None).and_then(|_| match has_features {
+                true => calls.round_trip(&structures, Some(&vec![&cotangent[..]; copies])).map(drop),
+                false => Ok(()),
+            });
+            match made {
+                Ok(()) => copies *= 2,
+                Err(Fault::Memory(message)) if copies > 1 => {
+                    let Shape { bonds, .. } = geometry.shape();
+                    info!(message, copies, "the memory of the device takes fewer structures");
+                    self.schedule.limit_bonds(bonds * copies / 2);
+                    break;
+                }
+                Err(other) => {
+                    fault = Some(other);
+                    break;
+                }
+            }
+        }
+        if let Some(fault) = fault {
+            self.restart(fault);
+        }
+        for event in early {
+            // A device that was closed meanwhile learns so again from its channel.
+            self.handle(event);
+        }
+    }
+
+    fn count(&mut self, call: &Outstanding, batch: &DeviceBatch, compiled: bool, now: Instant) {
+        let tickets = batch.tickets();
+        let bonds: usize = tickets.iter().map(|one| one.shape.bonds).sum();
+        let seconds = now.duration_since(call.sent).as_secs_f64();
+        self.setup.note(|statistics| {
+            statistics.batches += 1;
+            statistics.structures += tickets.len() as u64;
+            statistics.bonds += bonds as u64;
+            statistics.largest_batch = statistics.largest_batch.max(tickets.len() as u64);
+            statistics.compiled += if compiled { seconds } else { 0.0 };
+        });
+    }
+
+    /// Adds the time since the last event, if the server had work.
+    fn note_time(&mut self) {
+        let now = Instant::now();
+        let busy = self.busy_since.map_or(0.0, |since| now.duration_since(since).as_secs_f64());
+        self.busy_since = (!self.sent.is_empty()).then_some(now);
+        let elapsed = now.duration_since(self.started).as_secs_f64();
+        self.setup.note(|statistics| {
+            statistics.busy += busy;
+            statistics.elapsed = elapsed;
+        });
+    }
+}
