@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use calm::baselines::FeatureOrigin;
 use calm::{Artifact, Projection, ProjectionMismatch};
-use potentials::grace::{self, FeatureForm, GraceModel, UnfitProjection};
+use potentials::grace::FeatureForm;
 
 use crate::artifact_checks::check_belongs_to;
 use crate::exit_status::CommandError;
@@ -190,38 +190,6 @@ impl FeatureModel {
             dimension: self.dimension(),
         })
     }
-}
-
-/// The projection of a model, if it has one, in the form of artifacts.
-pub fn model_projection(model: &GraceModel) -> Option<Projection> {
-    let found = model.projection()?;
-    Some(Projection {
-        matrix: found.matrix.clone(),
-        rows: found.matrix.len() / found.dimension,
-        columns: found.dimension,
-        feature_dimension: found.feature_dimension(),
-        asinh: found.asinh,
-        normalised: found.normalize,
-        density_channels: found.density_channels,
-        density_scale: found.density_scale,
-    })
-}
-
-/// The model with this projection, in place of its own if it has one.
-///
-/// # Errors
-/// A projection of another basis.
-pub fn with_projection(model: GraceModel, projection: &Projection) -> Result<GraceModel, UnfitProjection> {
-    let layers = model.description().architecture.layers();
-    model.with_projection(grace::GraceProjection {
-        matrix: projection.matrix.clone(),
-        dimension: projection.columns,
-        normalize: projection.normalised,
-        density_channels: projection.density_channels,
-        density_scale: projection.density_scale,
-        asinh: projection.asinh,
-        layers,
-    })
 }
 
 fn without_projection(path: &Path) -> CommandError {

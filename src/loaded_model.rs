@@ -8,9 +8,10 @@ use calm::Projection;
 use potentials::ModelWithFeatures;
 use potentials::grace::{GraceModel, Precision, RadialPath};
 
+use crate::config::Config;
 use crate::exit_status::CommandError;
-use crate::feature_variant::{model_projection, with_projection};
 use crate::file_hash;
+use crate::grace_projection::{model_projection, with_projection};
 use crate::python_model;
 
 /// A model that is ready to be evaluated.
@@ -42,10 +43,24 @@ impl LoadedModel {
     /// A file that is neither, or a program that does not start.
     pub fn load(path: &Path) -> Result<Self, CommandError> {
         if path.extension().is_some_and(|extension| extension == "toml") {
-            return python_model::from_configuration(path);
+            return Self::from_configuration(path);
         }
-        let model = GraceModel::load_in(path, Precision::default(), RadialPath::default());
+        Self::load_export(path, Precision::default())
+    }
+
+    fn load_export(path: &Path, precision: Precision) -> Result<Self, CommandError> {
+        let model = GraceModel::load_in(path, precision, RadialPath::default());
         Ok(model.map_err(CommandError::input)?.into())
+    }
+
+    fn from_configuration(path: &Path) -> Result<Self, CommandError> {
+        let potential = Config::load_potential(path).map_err(CommandError::input)?;
+        let model = potential.model.get_ref();
+        let Some(python) = &potential.python else { return Self::load_export(model, potential.precision) };
+        let wrong = |error: String| CommandError::Input(format!("{}: {error}", path.display()));
+        let device = python_model::start(python.settings(model, potential.precision));
+        let device = device.map_err(|error| wrong(error.to_string()))?;
+        Ok(Self::Python(Arc::new(PythonModel::local(device).map_err(wrong)?)))
     }
 
     /// The model, for evaluators.

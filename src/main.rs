@@ -22,6 +22,7 @@ mod features;
 mod file_hash;
 mod filter;
 mod forgetting;
+mod grace_projection;
 mod initial_mixture;
 mod label_method;
 mod label_setup;

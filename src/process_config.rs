@@ -19,8 +19,8 @@ use workers::labeller::LabelBounds;
 use workers::settings::WalkSettings;
 
 use crate::exit_status::CommandError;
-use crate::feature_variant::with_projection;
 use crate::file_hash::verify_hash;
+use crate::grace_projection::with_projection;
 use crate::label_method::MethodConfig;
 use crate::label_setup::LabelSetup;
 use crate::log;
