@@ -58,6 +58,23 @@ impl Drop for DeviceWatch {
     }
 }
 
+/// Prepares the device of the campaign's model for the calls of this many walkers, if that is of use.
+///
+/// # Errors
+/// A crashed thread.
+pub async fn warm_up(campaign: &LoadedCampaign, walkers: u32) -> Result<(), CommandError> {
+    let Some(device) = campaign.model.device() else { return Ok(()) };
+    let description = &device.info().description;
+    if description.device == "cpu" && !description.padding {
+        return Ok(());
+    }
+    let seeds = campaign.seed_structures.iter().map(|seed| &seed.plan.structure);
+    let Some(largest) = seeds.max_by_key(|structure| structure.len()).cloned() else { return Ok(()) };
+    let (device, skin) = (Arc::clone(device), campaign.config.walk.skin.get());
+    let work = tokio::task::spawn_blocking(move || device.warm_up(&largest, skin, walkers as usize));
+    work.await.map_err(CommandError::failed)?.map_err(CommandError::Failed)
+}
+
 /// Whether the device of the campaign's model has failed for good.
 pub fn has_failed(campaign: &LoadedCampaign) -> bool {
     campaign.model.device().is_some_and(|device| device.broken().is_cancelled())

@@ -96,6 +96,7 @@ async fn run_walks(
     if !go_on {
         return Ok(reactor::RunOutcome::Stopped);
     }
+    device_watch::warm_up(run.campaign, wanted_walkers(&run.campaign.config)).await?;
     let order = LabelOrderTask::start(run).await?;
     let completion = order.completion.clone();
     let ended = match mode.in_process {
