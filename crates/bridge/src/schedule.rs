@@ -325,3 +325,169 @@ impl DeviceBatch {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const CLIENTS: u64 = 6;
+    const MOST: usize = 3;
+
+    /// What happens to a schedule.
+    #[derive(Clone, Copy, Debug)]
+    enum Step {
+        /// A client without a call calls.
+        Call(u64),
+        /// The server answers.
+        Answer,
+        /// The server reports a fault of its oldest batch, whose calls are made again.
+        Fault,
+        /// The server is lost with all that it has.
+        Loss,
+        /// Time passes, ms.
+        Wait(u64),
+    }
+
+    fn steps() -> impl Strategy<Value = Vec<Step>> {
+        let step = prop_oneof![
+            6 => (1..=CLIENTS).prop_map(Step::Call),
+            6 => Just(Step::Answer),
+            1 => Just(Step::Fault),
+            1 => Just(Step::Loss),
+            2 => (1_u64..20).prop_map(Step::Wait),
+        ];
+        prop::collection::vec(step, 1..200)
+    }
+
+    /// A schedule with clients that evaluate, then pull back, and so on.
+    struct Simulation {
+        schedule: Schedule,
+        now: Instant,
+        next_id: u64,
+        /// Calls that wait or are under way: number and client.
+        open: BTreeSet<(u64, u64)>,
+        sent: VecDeque<DeviceBatch>,
+        /// Clients whose next call is a pull-back.
+        evaluated: BTreeSet<u64>,
+    }
+
+    impl Simulation {
+        fn new() -> Self {
+            let schedule = Schedule::new(MOST);
+            let (open, sent, evaluated) = Default::default();
+            Self { schedule, now: Instant::now(), next_id: 1, open, sent, evaluated }
+        }
+
+        fn call(&mut self, client: u64) {
+            if self.open.iter().any(|(_, known)| *known == client) {
+                return;
+            }
+            let kind = match self.evaluated.contains(&client) {
+                true => Kind::PullBack,
+                false => Kind::Evaluate { follows: true, features: true },
+            };
+            let shape = Shape { structures: 1, atoms: 4, bonds: 10 };
+            let (id, since) = (self.next_id, self.now);
+            self.next_id += 1;
+            self.open.insert((id, client));
+            self.schedule.add(Ticket { id, client, kind, shape, since, alone: client == CLIENTS });
+        }
+
+        fn step(&mut self, step: Step) {
+            match step {
+                Step::Call(client) => self.call(client),
+                Step::Wait(time) => self.now += Duration::from_millis(time),
+                Step::Answer => {
+                    let Some(batch) = self.sent.pop_front() else { return };
+                    self.schedule.done(self.now);
+                    for ticket in batch.tickets() {
+                        assert!(self.open.remove(&(ticket.id, ticket.client)), "answered twice: {ticket:?}");
+                        match ticket.kind {
+                            Kind::PullBack => self.evaluated.remove(&ticket.client),
+                            Kind::Evaluate { .. } => self.evaluated.insert(ticket.client),
+                        };
+                    }
+                }
+                Step::Fault => {
+                    let Some(batch) = self.sent.pop_front() else { return };
+                    self.schedule.abort_oldest();
+                    self.schedule.put_back(batch.tickets());
+                }
+                Step::Loss => {
+                    let again = self.sent.drain(..).flat_map(|batch| batch.tickets()).collect();
+                    self.schedule.put_back(again);
+                    self.schedule.forget_server(0);
+                }
+            }
+            self.send();
+        }
+
+        fn send(&mut self) {
+            while let Next::Send(batch) = self.schedule.next(self.now) {
+                let tickets = batch.tickets();
+                assert!(!tickets.is_empty() && tickets.len() <= MOST, "{batch:?}");
+                assert!(
+                    tickets.len() == 1 || tickets.iter().all(|one| !one.alone || one.kind == Kind::PullBack)
+                );
+                let is_kept = matches!(batch, DeviceBatch::PullBackKept { .. });
+                let is_pull_back = !matches!(batch, DeviceBatch::Evaluate { .. });
+                for ticket in &tickets {
+                    assert_eq!(ticket.kind == Kind::PullBack, is_pull_back, "{batch:?}");
+                    assert!(!is_kept || self.evaluated.contains(&ticket.client));
+                }
+                self.sent.push_back(batch);
+                assert!(self.sent.len() <= AHEAD);
+            }
+        }
+    }
+
+    proptest! {
+        /// Whatever happens, each call is answered once, in batches that a server can do, and nothing waits for ever.
+        #[test]
+        fn every_call_is_answered_once(steps in steps()) {
+            let mut simulation = Simulation::new();
+            steps.into_iter().for_each(|step| simulation.step(step));
+            for _ in 0..4 * CLIENTS {
+                simulation.step(Step::Wait(PULL_BACK_GRACE.as_millis() as u64));
+                simulation.step(Step::Answer);
+            }
+            prop_assert!(simulation.open.is_empty(), "{:?}", simulation.open);
+        }
+    }
+
+    /// Walkers that call together go through the device together, and their pull-backs find the evaluation.
+    #[test]
+    fn pull_backs_use_the_kept_evaluation() {
+        let mut simulation = Simulation::new();
+        let calls = |simulation: &mut Simulation, clients: &[u64]| {
+            clients.iter().for_each(|client| simulation.step(Step::Call(*client)));
+        };
+        // Everyone is known to take part.
+        for client in [1, 1, 2, 2, 3, 3, 4, 4] {
+            calls(&mut simulation, &[client]);
+            simulation.step(Step::Answer);
+        }
+        calls(&mut simulation, &[1, 2, 3, 4]);
+        simulation.step(Step::Answer);
+        assert_eq!(simulation.sent[0].tickets().len(), 3, "the three that came while the device computed");
+        simulation.step(Step::Call(1));
+        simulation.step(Step::Answer);
+        calls(&mut simulation, &[2, 3]);
+        let first = simulation.sent.front().cloned();
+        assert!(
+            matches!(&first, Some(DeviceBatch::PullBackKept { tickets, .. }) if tickets.len() == 1),
+            "{first:?}"
+        );
+        simulation.step(Step::Answer);
+        simulation.step(Step::Call(4));
+        let second = simulation.sent.front().cloned();
+        assert!(
+            matches!(&second, Some(DeviceBatch::PullBackKept { tickets, .. }) if tickets.len() == 3),
+            "{second:?}"
+        );
+    }
+}
