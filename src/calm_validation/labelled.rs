@@ -9,6 +9,7 @@ mod estimate;
 mod figures;
 mod mixtures;
 mod report;
+mod score_name;
 mod sets;
 mod tables;
 #[cfg(test)]

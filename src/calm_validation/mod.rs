@@ -20,6 +20,7 @@ mod mixture_score;
 mod own_features;
 mod progress;
 mod random;
+mod set_names;
 mod solutions;
 mod tables;
 mod text;

@@ -2,7 +2,7 @@
 
 use super::detection::Detection;
 use super::labelled::LabelledSet;
-use super::text::of_set;
+use super::set_names::of_set;
 use super::{DetectionRule, Validation, labelled};
 use crate::page::{PageTable, TableCell, count, percent, real, text};
 

@@ -3,6 +3,7 @@
 use atoms::extxyz::{Column, ColumnData, Frame, write_frame};
 
 use super::labelled::LabelledSet;
+use super::set_names::of_set;
 use super::tables::both;
 use super::{Defect, MatchedPair, Validation, figures, tables};
 use crate::exit_status::CommandError;
@@ -146,11 +147,6 @@ fn labelled_set<'a>(
         table("mixtures"),
     ];
     blocks.into_iter().flatten().collect()
-}
-
-/// The name of a figure or a table of a set of labelled structures, from 0.
-pub fn of_set(name: &str, number: usize) -> String {
-    if number == 0 { name.to_owned() } else { format!("{name}-{}", number + 1) }
 }
 
 fn lead(validation: &Validation) -> String {

@@ -1,6 +1,7 @@
 //! `calmwalk launch`
 
 mod commands;
+mod cores_of_jobs;
 mod custom_scripts;
 mod job_specs;
 mod templates;

@@ -5,6 +5,7 @@ mod feature_match;
 mod lbfgs;
 mod null_space;
 pub mod octagon;
+mod random_rows;
 pub mod ranks;
 pub mod search;
 #[cfg(test)]

@@ -7,7 +7,7 @@ use atoms::cell::cross;
 
 use super::environments::EnvironmentDifference;
 use super::feature_match::{AllowedDistances, FeatureMatch};
-use super::ranks::{SURPLUS, random_weights, rank};
+use super::random_rows::{SURPLUS, random_weights, rank};
 use crate::calm_validation::random::RandomSequence;
 
 /// Root mean square path of a neighbour in a step, Å.

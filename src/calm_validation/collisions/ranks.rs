@@ -7,16 +7,13 @@ use atoms::Species;
 use serde::Serialize;
 
 use super::feature_match::cluster;
+use super::random_rows::{SURPLUS, random_weights, rank};
 use super::search::{MatchedFeatures, NEIGHBOURS, allowed, first_environment, searched};
 use crate::all_cores;
 use crate::calm_validation::random::RandomSequence;
 use crate::calm_validation::{Subject, ValidationProgress, ValidationSettings};
 use crate::features::FeatureCalculator;
 
-/// Singular values below this share of the largest are rounding.
-const ROUNDING: f64 = 1e-10;
-/// Random combinations of rows beyond the largest possible rank: with probability 1, they have the rank of all rows.
-pub const SURPLUS: usize = 4;
 /// Number of the first sequence of random numbers; the searches have those before.
 const SEQUENCES: u64 = 1 << 41;
 
@@ -119,15 +116,4 @@ fn examine(
         smallest: values[rank.checked_sub(1)?] / largest,
         next: values.get(rank).map(|next| next / largest),
     })
-}
-
-/// Number of singular values above rounding.
-pub fn rank(values: &[f64]) -> usize {
-    let limit = ROUNDING * values.first().copied().unwrap_or(0.0);
-    values.iter().filter(|value| **value > limit).count()
-}
-
-/// Standard normal numbers, `[count][dimension]`.
-pub fn random_weights(count: usize, dimension: usize, random: &mut RandomSequence) -> Vec<Vec<f64>> {
-    (0..count).map(|_| (0..dimension).map(|_| random.normal()).collect()).collect()
 }

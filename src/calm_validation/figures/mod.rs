@@ -9,7 +9,7 @@ mod structures;
 
 use super::defects::DefectKind;
 use super::labelled::LabelledSet;
-use super::text::of_set;
+use super::set_names::of_set;
 use super::{Validation, labelled};
 use crate::page::FigureEntry;
 

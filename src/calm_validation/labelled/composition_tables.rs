@@ -1,7 +1,7 @@
 //! Tables of errors and scores by element and by composition.
 
 use super::report::{ErrorSpread, LabelledReport};
-use super::tables::name;
+use super::score_name::name;
 use crate::page::{PageTable, count, percent, real, text};
 
 /// By element and score; without rows if there is only one element.

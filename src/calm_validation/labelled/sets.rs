@@ -5,7 +5,8 @@ use serde::Serialize;
 use super::collect::LARGE_ERROR;
 use super::mixtures::ComparedMixture;
 use super::report::{LabelledReport, ScoreReport};
-use super::tables::{CONTAMINATION, cells, name};
+use super::score_name::name;
+use super::tables::{CONTAMINATION, cells};
 use crate::page::{PageTable, count, real, text};
 
 /// The labelled structures of a file, and what they say.

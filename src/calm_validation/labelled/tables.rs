@@ -7,6 +7,7 @@ use analysis::SHOWN_ERROR_THRESHOLDS;
 use super::collect::LARGE_ERROR;
 use super::composition_tables::{compositions, elements};
 use super::report::{Bin, IntervalEstimate, LabelledReport, MeanErrors, ScoreReport};
+use super::score_name::name;
 use crate::output::{self, range};
 use crate::page::{PageTable, TableCell, count, percent, real, text};
 
@@ -187,11 +188,6 @@ const INTERVAL: &str = "interval";
 fn intervals(report: &LabelledReport) -> String {
     let level = 100.0 * report.bootstrap.level;
     format!("with {level:.0} % intervals (bootstrap over structures) here and below")
-}
-
-/// The name of a score without markup, which cells do not support.
-pub(super) fn name(score: &ScoreReport) -> TableCell {
-    text(::figures::plain(&score.name))
 }
 
 /// Value and interval.

@@ -7,7 +7,7 @@ use orchestrator::batch::{CustomClient, DesiredJobs, JobNames, JobRequest, Role,
 
 use super::LaunchArgs;
 use super::commands::{JobCommands, text};
-use super::job_specs::CoresOfJobs;
+use super::cores_of_jobs::CoresOfJobs;
 use super::templates::fill;
 use super::time_limit::time_limit;
 use crate::exit_status::CommandError;

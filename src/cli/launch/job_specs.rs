@@ -9,6 +9,7 @@ use orchestrator::batch::{
 };
 
 use super::commands::{ENDPOINT, JobCommands, text};
+use super::cores_of_jobs::CoresOfJobs;
 use super::custom_scripts::{self, CustomScripts};
 use super::templates::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, TemplateValues, fill, template};
 use super::{LaunchArgs, System};
@@ -31,14 +32,6 @@ pub struct JobSpecs {
     /// Options of jobs with walkers.
     walk_options: Vec<String>,
     walkers: u32,
-}
-
-/// Cores of each kind of job.
-#[derive(Clone, Copy)]
-pub(super) struct CoresOfJobs {
-    pub orchestrator: usize,
-    pub agent: usize,
-    pub labeller: usize,
 }
 
 impl JobSpecs {
