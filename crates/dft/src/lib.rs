@@ -40,3 +40,4 @@ pub use pinned_file::PinnedFile;
 pub use retry_adjustment::{RetryAdjustment, adjustments};
 pub use settings::DftSettings;
 pub use smearing::Smearing;
+pub use version_query::{ProgramError, output_of};

@@ -65,28 +65,48 @@ fn output(
         ));
     };
     let directory = working_directory(files).map_err(|error| wrong(error.to_string()))?;
-    let mut child = Command::new(program)
-        .args(first)
-        .args(arguments)
-        .env_clear()
-        .envs(passed.from_current_process())
-        .envs(environment)
-        .current_dir(directory.path())
-        .stdin(Stdio::null())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .map_err(|error| wrong(format!("does not start ({error}): install it, or correct `command`")))?;
+    let mut query = Command::new(program);
+    query.args(first).args(arguments);
+    query.env_clear().envs(passed.from_current_process()).envs(environment).current_dir(directory.path());
+    output_of(query).map_err(|error| match error {
+        ProgramError::Start(error) => {
+            wrong(format!("does not start ({error}): install it, or correct `command`"))
+        }
+        other => wrong(other.to_string()),
+    })
+}
+
+/// Why a program says nothing.
+#[derive(Debug, thiserror::Error)]
+pub enum ProgramError {
+    /// It cannot be started.
+    #[error("does not start: {0}")]
+    Start(std::io::Error),
+    /// It does not end.
+    #[error("did not answer within {} s", TIMEOUT.as_secs())]
+    Timeout,
+    /// The system does not say how it ended.
+    #[error(transparent)]
+    Wait(std::io::Error),
+}
+
+/// Status, standard output and standard error of a program without input that ends soon.
+///
+/// # Errors
+/// It does not start, or does not end within two minutes, after which it is killed.
+pub fn output_of(mut program: Command) -> Result<(ExitStatus, String, String), ProgramError> {
+    program.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut child = program.spawn().map_err(ProgramError::Start)?;
     let (stdout, stderr) = (drain(child.stdout.take()), drain(child.stderr.take()));
     let begin = Instant::now();
     let status = loop {
-        match child.try_wait().map_err(|error| wrong(error.to_string()))? {
+        match child.try_wait().map_err(ProgramError::Wait)? {
             Some(status) => break status,
             None if begin.elapsed() > TIMEOUT => {
                 // It may have just ended.
                 let _ = child.kill();
                 let _ = child.wait();
-                return Err(wrong(format!("did not answer within {} s", TIMEOUT.as_secs())));
+                return Err(ProgramError::Timeout);
             }
             None => std::thread::sleep(Duration::from_millis(5)),
         }

@@ -1,16 +1,9 @@
 //! Programs on the path, and what they answer.
 
 use std::ffi::OsStr;
-use std::io::Read;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
-
-/// Programs answer at once, but a cold file system or a driver may be slow.
-const TIMEOUT: Duration = Duration::from_secs(60);
-/// Time between two looks at a program.
-const POLL: Duration = Duration::from_millis(5);
+use std::process::Command;
 
 /// Where an executable of this name is on the path.
 pub fn find(name: &str) -> Option<PathBuf> {
@@ -30,45 +23,14 @@ fn is_executable(file: &Path) -> bool {
 /// # Errors
 /// Why it does not start, how it fails, or that it does not end.
 pub fn ask(program: &Path, arguments: &[&str]) -> Result<String, String> {
-    let mut child = Command::new(program)
-        .args(arguments)
-        .stdin(Stdio::null())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .map_err(|error| format!("does not start: {error}"))?;
-    let (stdout, stderr) = (drain(child.stdout.take()), drain(child.stderr.take()));
-    let begin = Instant::now();
-    let status = loop {
-        match child.try_wait().map_err(|error| error.to_string())? {
-            Some(status) => break status,
-            None if begin.elapsed() > TIMEOUT => {
-                // It may have just ended.
-                let _ = child.kill();
-                let _ = child.wait();
-                return Err(format!("did not answer within {} s", TIMEOUT.as_secs()));
-            }
-            None => std::thread::sleep(POLL),
-        }
-    };
-    let [stdout, stderr] = [stdout, stderr].map(|text| text.join().unwrap_or_default());
+    let mut query = Command::new(program);
+    query.args(arguments);
+    let (status, stdout, stderr) = dft::output_of(query).map_err(|error| error.to_string())?;
     let said = if stdout.trim().is_empty() { stderr } else { stdout };
     match status.success() {
         true => Ok(said.trim().to_owned()),
         false => Err(format!("{status}: {}", said.trim().lines().next_back().unwrap_or("it says nothing"))),
     }
-}
-
-/// Reads to the end, so that the program never blocks on a full pipe.
-fn drain(pipe: Option<impl Read + Send + 'static>) -> std::thread::JoinHandle<String> {
-    std::thread::spawn(move || {
-        let mut bytes = Vec::new();
-        if let Some(mut pipe) = pipe {
-            // What was read before an error is still useful.
-            let _ = pipe.read_to_end(&mut bytes);
-        }
-        String::from_utf8_lossy(&bytes).into_owned()
-    })
 }
 
 #[cfg(test)]
