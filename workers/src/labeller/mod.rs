@@ -4,6 +4,7 @@
 //! orchestrator.
 
 mod batch_access;
+mod batch_job;
 mod blocking;
 mod calculation_handle;
 mod calculation_request;

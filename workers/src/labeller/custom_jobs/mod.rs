@@ -21,33 +21,24 @@ use store::StoreError;
 use tokio::time::sleep;
 use tracing::{info, warn};
 
+use super::batch_job::{
+    CANCEL_TIMEOUT, COMMAND_TIMEOUT, MAX_POLL_INTERVAL, MAX_REFUSALS, MIN_POLL_INTERVAL, RETRY_INTERVAL,
+    SCRATCH_NOT_SHARED, own_user, settle,
+};
 use super::calculation_runner::{Calculation, CalculationEnd};
 use super::calculation_state::CalculationState;
 use super::file_error::file_error;
 use super::private_directory;
-use super::slurm::{SCRATCH_NOT_SHARED, own_user, settle};
 use job::{JobSubmission, MAX_SUBMISSIONS};
 
 pub(super) use job::CustomJob;
 
-/// Timeout of the commands.
-const COMMAND_TIMEOUT: Duration = Duration::from_secs(60);
-/// Initial time between two checks of a calculation's directory.
-const MIN_POLL_INTERVAL: Duration = Duration::from_millis(50);
-/// Longest time between two checks of a calculation's directory.
-const MAX_POLL_INTERVAL: Duration = Duration::from_secs(2);
 /// Time between two questions to the batch system about a job.
 const QUESTION_INTERVAL: Duration = Duration::from_secs(30);
-/// Time between two tries of a command that failed.
-const RETRY_INTERVAL: Duration = Duration::from_secs(3);
 /// A batch system may not know a job for this long after it was submitted.
 const NOT_YET_KNOWN: Duration = Duration::from_secs(60);
 /// A job whose id was lost is over this long after its time limit.
 const LOST_MARGIN: Duration = Duration::from_secs(600);
-/// Largest number of refusals by a batch system that answers.
-const MAX_REFUSALS: u32 = 3;
-/// How long a cancelled job may take to end before its directory is left for later.
-const CANCEL_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Access to a custom batch system for calculations.
 pub(super) struct CustomJobs {

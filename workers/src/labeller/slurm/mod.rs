@@ -16,11 +16,10 @@ mod squeue;
 mod squeue_cache;
 
 use std::ffi::OsStr;
-use std::fs;
 use std::io;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use ::batch::{JobPhase, SlurmClient, SlurmError};
 use dft::PassedEnvironment;
@@ -29,6 +28,10 @@ use tokio::sync::OnceCell;
 use tokio::time::sleep;
 use tracing::{info, warn};
 
+use super::batch_job::{
+    CANCEL_TIMEOUT, COMMAND_TIMEOUT, MAX_POLL_INTERVAL, MAX_REFUSALS, MIN_POLL_INTERVAL, RETRY_INTERVAL,
+    SCRATCH_NOT_SHARED, own_user, settle,
+};
 use super::calculation_runner::CalculationEnd;
 use super::calculation_state::CalculationState;
 use super::file_error::file_error;
@@ -40,21 +43,6 @@ use squeue_cache::SQUEUE_INTERVAL;
 pub(super) use job::CalculationJob;
 pub(super) use script::{JobRequirements, runner, write};
 pub(super) use squeue_cache::remove_cache;
-
-/// Timeout of Slurm's commands.
-const COMMAND_TIMEOUT: Duration = Duration::from_secs(60);
-/// Initial time between two checks of a calculation's directory.
-const MIN_POLL_INTERVAL: Duration = Duration::from_millis(50);
-/// Longest time between two checks of a calculation's directory.
-const MAX_POLL_INTERVAL: Duration = Duration::from_secs(2);
-/// Delay after which files written by a node are visible here.
-const SETTLE_TIME: Duration = Duration::from_secs(2);
-/// Time between two tries to submit.
-const RETRY_INTERVAL: Duration = Duration::from_secs(3);
-/// Maximum number of refusals by a Slurm that responds.
-const MAX_REFUSALS: u32 = 3;
-/// How long a cancelled job may take to end before its directory is left for later.
-const CANCEL_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Access to Slurm for calculations.
 pub(super) struct Slurm {
@@ -252,23 +240,8 @@ impl Slurm {
     }
 }
 
-pub(super) const SCRATCH_NOT_SHARED: &str =
-    "label.scratch must be a directory that this host and every node see under the same name";
-
-pub(super) fn own_user() -> u32 {
-    rustix::process::getuid().as_raw()
-}
-
 fn job_error(job: &CalculationJob, why: impl ToString) -> StoreError {
     file_error(&job.directory, io::Error::other(why.to_string()))
-}
-
-/// Makes files from other hosts visible: a network file system refreshes a directory when a file is created in it.
-pub(super) async fn settle(directory: &Path) {
-    sleep(SETTLE_TIME).await;
-    let new = directory.join("look");
-    // A program may have left a file of that name, and opening a pipe would block.
-    let _ = fs::File::create_new(&new).and_then(|_| fs::remove_file(&new));
 }
 
 #[cfg(test)]
