@@ -18,8 +18,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from blake3 import blake3
+
 from . import checksums, frames, tables
-from .blake3 import blake3
 from .blocks import Component, Structure, decode_component, decode_structure
 from .candidates import LABEL_COLUMNS, CandidateFilter, CandidateReader, decode_label
 from .checksums import Row
@@ -293,7 +294,7 @@ class Campaign:
             "SELECT data FROM version_file WHERE version = ? AND name = ?", [number, name]
         )
         data = bytes(rows[0]["data"]) if rows else b""
-        expected, found = getattr(record, f"{name}_hash"), blake3(data)
+        expected, found = getattr(record, f"{name}_hash"), blake3(data).hexdigest()
         if found != expected:
             raise DamagedError(
                 f"damaged database: the {name} of version {number}: its BLAKE3 hash is {found}, and {expected} was stored with it"

@@ -421,22 +421,6 @@ class EncodingTests(unittest.TestCase):
         except MissingPackage as error:
             self.assertIn("pip install zstandard", str(error))
 
-    def test_blake3_of_published_vectors(self) -> None:
-        """BLAKE3's test_vectors.json: bytes 0 to 250 repeated, the first 32 bytes of the hash."""
-        from calmwalk.blake3 import blake3
-
-        vectors = {
-            0: "af1349b9f5f9a1a6a0404dea36dcc9499bcb25c9adc112b7cc9a93cae41f3262",
-            1: "2d3adedff11b61f14c886e35afa036736dcd87a74d27b5c1510225d0f592e213",
-            1023: "10108970eeda3eb932baac1428c7a2163b0e924c9a9e25b35bba72b28f70bd11",
-            1024: "42214739f095a406f3fc83deb889744ac00df831c10daa55189b5d121c855af7",
-            1025: "d00278ae47eb27b34faecf67b4fe263f82d5412916c1ffd97c8cb7fb814b8444",
-            3073: "7124b49501012f81cc7f11ca069ec9226cecb8a2c850cfe644e327d22d3e1cd3",
-            102400: "bc3e3d41a1146b069abffad3c0d44860cf664390afce4d9661f7902e7943e085",
-        }
-        for length, expected in vectors.items():
-            self.assertEqual(blake3(bytes(k % 251 for k in range(length))), expected, length)
-
 
 if __name__ == "__main__":
     unittest.main()
