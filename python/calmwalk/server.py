@@ -6,6 +6,7 @@ to standard error, so that what libraries print cannot mix with answers.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import sys
@@ -244,9 +245,18 @@ def _done(call: int, started: float, compiled: bool) -> dict[str, Any]:
     return {"status": "ok", "id": call, "seconds": time.perf_counter() - started, "compiled": bool(compiled)}
 
 
+def _end_with_parent() -> None:
+    """Has the system kill this process when its parent is gone, also in the middle of a call (Linux: prctl, PR_SET_PDEATHSIG)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+
+
 def main() -> int:
     """Serves until shutdown or the end of standard input."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Ctrl-C and batch systems signal all processes; walkers finish their step, for which they need this one.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    _end_with_parent()
     connection = take_streams()
     server = Server()
     for line in connection.lines():
