@@ -22,7 +22,7 @@ pub struct PythonSection {
     pub launcher: Vec<String>,
     /// Adapter that evaluates the model: `gracemaker`, `mace`, `ase`, or your own as `file.py:Class` or `module:Class`.
     pub adapter: String,
-    /// Settings of the adapter (see docs/python-adapters.md). Default: none.
+    /// Settings of the adapter (see docs/python-adapters.md); paths in it are absolute. Default: none.
     #[serde(default)]
     #[schemars(with = "std::collections::BTreeMap<String, serde_json::Value>")]
     pub options: serde_json::Map<String, serde_json::Value>,
