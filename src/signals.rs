@@ -11,12 +11,12 @@ use tokio_util::sync::CancellationToken;
 use crate::exit_status::CommandError;
 use crate::output::log_and_print;
 
-/// A batch system signals every process of a job, with SIGTERM or SIGINT, and the job script forwards the signal it receives. Signals
-/// within this time count as one request.
-const SIGNAL_MERGE_WINDOW: Duration = Duration::from_secs(5);
+/// A batch system signals every process of a job, with SIGTERM or SIGINT, and the job script forwards the signal it receives. LSF sends
+/// SIGTERM 10 s after SIGINT. Signals within this time count as one request.
+const SIGNAL_MERGE_WINDOW: Duration = Duration::from_secs(15);
 
-/// Cancels `stop` and prints `message` on the first Ctrl-C, SIGTERM or hang-up. A second signal exits at once, which is
-/// safe too, unless it comes within [`SIGNAL_MERGE_WINDOW`] of the first and is no Ctrl-C at a terminal.
+/// Cancels `stop` and prints `message` on the first Ctrl-C, SIGTERM or hang-up. A second Ctrl-C at a terminal exits at
+/// once, which is safe too. Other signals within [`SIGNAL_MERGE_WINDOW`] of the first are the same request; a later one exits at once.
 pub fn cancel_on_signal(stop: CancellationToken, message: &'static str) -> Result<(), CommandError> {
     let mut interrupt = signal(SignalKind::interrupt()).map_err(CommandError::failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(CommandError::failed)?;

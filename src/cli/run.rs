@@ -43,7 +43,7 @@ use crate::{log, summary, web};
 /// Run a campaign until it is finished, or resume it
 ///
 /// The same command starts a campaign and resumes it after any interruption. Ctrl-C or SIGTERM checkpoints the walks and exits
-/// within seconds (exit code 130); a second signal exits at once.
+/// within seconds (exit code 130); a second Ctrl-C exits at once.
 #[derive(Debug, clap::Args)]
 pub struct RunArgs {
     /// Configuration of the campaign (TOML)
