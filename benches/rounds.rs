@@ -16,7 +16,7 @@ use std::time::Duration;
 use atoms::MinDistanceRule;
 use calm::forgetting::ForgettingAlarm;
 use calm::{Artifact, UpdateSettings};
-use md::{LangevinSettings, ThermostatSettings};
+use md::{BarostatSettings, LangevinSettings, ThermostatSettings};
 use orchestrator::grader::Grader;
 use orchestrator::selector::{
     CampaignMode, OnForgetting, Scheduling, SeedStructurePlan, Selector, SelectorSettings, SelectorSnapshot,
@@ -27,6 +27,7 @@ use potentials::{ZblWindow, ZblWindows};
 use rustix::time::{ClockId, clock_gettime};
 use wire::messages::{AssignmentReport, Outcome};
 use wire::{CampaignId, CandidateBlock, Origin, WalkConditions};
+use workers::cell_bias::CellBiasSettings;
 use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
 
@@ -189,6 +190,9 @@ fn walk_settings() -> WalkSettings {
         equilibration_steps: 500,
         biased_steps: 2000,
         bias_averaging_steps: 10,
+        barostat: BarostatSettings::default(),
+        reference_steps: 0,
+        cell_bias: CellBiasSettings::default(),
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nmin_atoms = 3")
             .unwrap(),

@@ -29,7 +29,7 @@ pub enum EarlyEndCause {
 /// The walks that ended in one way.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct EndCount {
-    /// `completed`, `quota_reached`, `budget`, `superseded`, `nothing_new`, `trapped`, `diverged` or `invalid_start`.
+    /// `completed`, `quota_reached`, `budget`, `superseded`, `nothing_new`, `volume_boundary`, `trapped`, `diverged` or `invalid_start`.
     pub end: String,
     /// `None` if the walks did not end early.
     pub cause: Option<EarlyEndCause>,
@@ -53,9 +53,8 @@ pub struct WalkEnds(Vec<EndCount>);
 pub fn early_end_cause(state: &str, reason: &str) -> Option<EarlyEndCause> {
     let has = |words: &str| reason.contains(words);
     match state {
-        "waiting" | "running" | "completed" | "quota_reached" | "budget" | "superseded" | "nothing_new" => {
-            None
-        }
+        "waiting" | "running" | "completed" | "quota_reached" | "budget" | "superseded" | "nothing_new"
+        | "volume_boundary" => None,
         "trapped" => Some(EarlyEndCause::Trapped),
         _ if has("walkers crashed") || has("walker crashed") => Some(EarlyEndCause::Crashed),
         "invalid_start" => Some(EarlyEndCause::InvalidStart),

@@ -26,6 +26,7 @@ from .candidates import LABEL_COLUMNS, CandidateFilter, CandidateReader, decode_
 from .checksums import Row
 from .records import (
     Candidate,
+    ConstantPressure,
     Decision,
     Imported,
     Label,
@@ -373,7 +374,12 @@ class Campaign:
             checksums.WALK_CONDITIONS.verify(row)
             values = json.loads(row["conditions"])
             ramp = values.get("volume_ramp")
-            values |= {"volume_ramp": ramp and tuple(ramp), "version": values.get("version", 0)}
+            constant = values.get("constant_pressure")
+            values |= {
+                "volume_ramp": ramp and tuple(ramp),
+                "constant_pressure": constant and ConstantPressure(**constant),
+                "version": values.get("version", 0),
+            }
             found[row["walk"]] = WalkConditions(
                 **{field.name: values[field.name] for field in fields(WalkConditions)}
             )

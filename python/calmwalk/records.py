@@ -9,6 +9,18 @@ from .blocks import Floats, Structure
 
 
 @dataclass(frozen=True)
+class ConstantPressure:
+    """The conditions of a walk at constant pressure."""
+
+    pressure: float
+    """bar"""
+    start_volume: float
+    """V/V₀ at its first step."""
+    cell_bias: bool
+    """Whether its cell is biased."""
+
+
+@dataclass(frozen=True)
 class WalkConditions:
     """The conditions of a walk."""
 
@@ -19,7 +31,9 @@ class WalkConditions:
     tau: float
     """Uncertainty-force scale τ at its start."""
     volume_ramp: tuple[float, float] | None
-    """V/V₀ at the first and at the last biased step; None for a fixed cell."""
+    """V/V₀ at the first and at the last biased step; None for a fixed cell, or one at constant pressure."""
+    constant_pressure: ConstantPressure | None
+    """Of a walk with a barostat."""
     repeat: int
     """Number among the walks under the same conditions, from 0."""
     version: int

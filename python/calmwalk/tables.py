@@ -108,11 +108,15 @@ _WALK = """walk:int origin:text partner:int seed_structure:int seed_structure_na
 def _walks(campaign: Campaign) -> Iterator[Record]:
     for walk in campaign.walks():
         ramp = (walk.conditions and walk.conditions.volume_ramp) or (None, None)
+        constant = walk.conditions and walk.conditions.constant_pressure
         yield {
             **{name: getattr(walk, name) for name in _columns(_WALK)},
             **_of_walk(walk.conditions),
             "volume_from": ramp[0],
             "volume_to": ramp[1],
+            "pressure": constant and constant.pressure,
+            "start_volume": constant and constant.start_volume,
+            "cell_bias": constant and constant.cell_bias,
             "repeat": walk.conditions.repeat if walk.conditions else None,
         }
 
@@ -170,7 +174,8 @@ TABLES: dict[str, Table] = {
         ),
         _labels,
     ),
-    "walks": Table(_columns(f"{_WALK} {_OF_WALK} volume_from:float volume_to:float repeat:int"), _walks),
+    "walks": Table(_columns(f"{_WALK} {_OF_WALK} volume_from:float volume_to:float
+            pressure:float start_volume:float cell_bias:bool repeat:int"), _walks),
     "mixtures": Table(
         _columns(
             """mixture_version:int decision:int kind:text candidate:text walk:int alpha:float components:int

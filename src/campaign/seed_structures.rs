@@ -15,7 +15,7 @@ use wire::ContentHash;
 use super::geometry::Geometry;
 use super::loader::Loader;
 use crate::all_cores;
-use crate::config::{ConfigError, OnInvalid, Warning, location};
+use crate::config::{ConfigError, OnInvalid, WalkSection, Warning, location};
 
 const FILES: &str = "seed_structures.files";
 
@@ -221,13 +221,16 @@ impl Loader<'_> {
             ));
         }
         // Groups of walks say for themselves which of them change the volume.
-        let ramp = self.config.walk.volume_ramp.filter(|_| self.config.walks.is_empty());
-        if ramp.is_some() && structure.periodic == [false; 3] {
-            return Err(
-                "the structure has no periodic direction, and so no volume for walk.volume_ramp to change; give it a \
-                 cell (Lattice=… in its comment line), or leave walk.volume_ramp out"
-                    .to_owned(),
-            );
+        let WalkSection { volume_ramp, barostat, .. } = &self.config.walk;
+        let changes = [("walk.volume_ramp", volume_ramp.is_some()), ("walk.barostat", barostat.is_some())];
+        let changes_volume = changes.into_iter().find(|(_, given)| *given && self.config.walks.is_empty());
+        if let Some((key, _)) = changes_volume
+            && structure.periodic == [false; 3]
+        {
+            return Err(format!(
+                "the structure has no periodic direction, and so no volume for {key} to change; give it a \
+                 cell (Lattice=… in its comment line), or leave {key} out"
+            ));
         }
         Ok(())
     }

@@ -3,8 +3,9 @@
 use std::collections::BTreeMap;
 
 use atoms::Structure;
+use calm::rules::Positive;
 use orchestrator::selector::SeedStructurePlan;
-use wire::WalkConditions;
+use wire::{ConstantPressure, WalkConditions};
 
 use super::loader::Loader;
 use super::seed_structures::{SeedStructures, SourcedStructure, listed};
@@ -152,19 +153,17 @@ fn is_selected(filter: &StructureFilter, name: &str, structure: &Structure) -> b
 /// All combinations of a group's conditions: by temperature, then by volume ramp, then by τ, then the repeats.
 fn combinations(walk: &WalkSection, group: &WalkGroupSection) -> Vec<WalkConditions> {
     let or = |values: &[_], default| if values.is_empty() { vec![default] } else { values.to_vec() };
-    let ramps = match group.volume_ramps.as_slice() {
-        [] => vec![walk.volume_ramp],
-        ramps => ramps.iter().copied().map(Some).collect(),
-    };
+    let cells = cells(walk, group);
     let mut walks = Vec::new();
     for temperature in or(&group.temperatures, walk.temperature) {
-        for ramp in &ramps {
+        for (volume_ramp, constant_pressure) in cells.iter().copied() {
             for tau in or(&group.tau_values, walk.tau) {
                 let conditions = |repeat| WalkConditions {
                     group: group.name.clone(),
                     temperature: temperature.get(),
                     tau: tau.get(),
-                    volume_ramp: ramp.map(|VolumeRampSection { from, to }| (from.get(), to.get())),
+                    volume_ramp,
+                    constant_pressure,
                     repeat,
                     version: 0,
                 };
@@ -173,6 +172,31 @@ fn combinations(walk: &WalkSection, group: &WalkGroupSection) -> Vec<WalkConditi
         }
     }
     walks
+}
+
+/// A volume ramp, or a constant pressure, or neither.
+type CellConditions = (Option<(f64, f64)>, Option<ConstantPressure>);
+
+/// What the cells of a group's walks do: its ramps, or each pressure with each volume at the start.
+fn cells(walk: &WalkSection, group: &WalkGroupSection) -> Vec<CellConditions> {
+    let ramp = |ramp: VolumeRampSection| (Some((ramp.from.get(), ramp.to.get())), None);
+    if !group.volume_ramps.is_empty() {
+        return group.volume_ramps.iter().copied().map(ramp).collect();
+    }
+    let pressures = match (group.pressures.as_slice(), &walk.barostat) {
+        ([], None) => return vec![walk.volume_ramp.map_or((None, None), ramp)],
+        ([], Some(barostat)) => vec![barostat.pressure],
+        (pressures, _) => pressures.to_vec(),
+    };
+    let volumes = match group.start_volumes.as_slice() {
+        [] => vec![walk.start_volume],
+        volumes => volumes.to_vec(),
+    };
+    let cell_bias = group.cell_bias.unwrap_or(walk.cell_bias.is_some());
+    let constant = |pressure: f64, start: Positive| {
+        (None, Some(ConstantPressure { pressure, start_volume: start.get(), cell_bias }))
+    };
+    pressures.iter().flat_map(|pressure| volumes.iter().map(|start| constant(*pressure, *start))).collect()
 }
 
 #[cfg(test)]

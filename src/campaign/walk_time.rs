@@ -39,6 +39,8 @@ pub struct StepTimes {
     classes: BTreeMap<u32, [f64; 2]>,
     /// Steps of a walk: of equilibration, and biased.
     steps: [f64; 2],
+    /// Steps of the reference run of a walk at constant pressure.
+    reference: f64,
     /// Whether walks have control walks.
     control: bool,
 }
@@ -71,8 +73,9 @@ impl StepTimes {
             }
         }
         let walk = &campaign.config.walk;
-        let steps = [walk.equilibration_steps as f64, walk.biased_steps.get() as f64];
-        Ok(Self { classes, steps, control: campaign.config.campaign.control })
+        let steps = [walk.equilibration_steps, walk.biased_steps.get()].map(|steps| steps as f64);
+        let reference = walk.reference_steps as f64;
+        Ok(Self { classes, steps, reference, control: campaign.config.campaign.control })
     }
 
     /// The sum over seed structures. `None` if no step could be measured.
@@ -101,6 +104,8 @@ impl StepTimes {
         let [equilibration, biased] = self.steps;
         let (from, to) = conditions.volume_ramp.unwrap_or((1.0, 1.0));
         let (equilibration, biased) = (equilibration / from, biased * mean_density(from, to));
+        let reference = if conditions.constant_pressure.is_some() { self.reference } else { 0.0 };
+        let equilibration = reference + equilibration;
         let control = if self.control { equilibration + biased } else { 0.0 };
         [[biased, equilibration], [0.0, control]]
     }
@@ -135,7 +140,8 @@ fn step_time(
     mixture: &Arc<Mixture>,
 ) -> Option<f64> {
     // At the volume of the seed structure.
-    let conditions = WalkConditions { volume_ramp: None, ..seed.plan.walks.first()?.clone() };
+    let conditions =
+        WalkConditions { volume_ramp: None, constant_pressure: None, ..seed.plan.walks.first()?.clone() };
     let assignment = Assignment {
         campaign: CampaignId([0; 16]),
         walk: WalkId(0),

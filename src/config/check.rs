@@ -1,16 +1,19 @@
 //! Rules between keys, which the types and ranges of single keys cannot express.
 
+mod constant_pressure;
 mod refit;
 
 use std::collections::HashSet;
 
 use atoms::MinDistanceRule;
+use calm::rules::Positive;
 use md::{ThermostatSettings, WrongSetting};
 use orchestrator::selector::{CampaignMode, UpdateProtocol};
 use potentials::{RadiiWindows, ZblWindow, ZblWindows};
 use store::ServerUrl;
 use workers::labeller::BatchSystem;
 
+use self::constant_pressure::check_constant_pressure;
 use self::refit::check_refit;
 use super::error::InvalidValue;
 use super::ranges;
@@ -31,6 +34,7 @@ pub fn check(config: &Config) -> Vec<InvalidValue> {
         check_min_distances(config),
         check_zbl(config),
         check_groups(config),
+        check_constant_pressure(config),
         check_temperature(config),
         check_store(config),
         check_queue(config),
@@ -291,11 +295,15 @@ fn check_groups(config: &Config) -> Result<(), InvalidValue> {
         let all = [
             ("temperatures", "walk.temperature", group.temperatures.clone()),
             ("volume_ramps", "walk.volume_ramp.from", volumes.collect()),
+            ("start_volumes", "walk.start_volume", group.start_volumes.clone()),
             ("tau_values", "walk.tau", group.tau_values.clone()),
         ];
-        for (name, of_walk, values) in all {
+        let numbers =
+            all.map(|(name, key, values)| (name, key, values.into_iter().map(Positive::get).collect()));
+        let pressures = ("pressures", "walk.barostat.pressure", group.pressures.clone());
+        for (name, of_walk, values) in numbers.into_iter().chain([pressures]) {
             let impossible =
-                values.into_iter().find_map(|value| ranges::expected_instead(of_walk, value.get()));
+                Vec::into_iter(values).find_map(|value| ranges::expected_instead(of_walk, value));
             if let Some((found, expected)) = impossible {
                 return wrong(&key(name), found, expected);
             }

@@ -38,6 +38,15 @@ pub fn thermostat() -> ThermostatSettings {
     ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 })
 }
 
+/// As in the paper.
+pub fn reference_steps() -> u64 {
+    5000
+}
+
+pub fn start_volume() -> Positive {
+    positive(1.0)
+}
+
 pub fn bias_averaging_steps() -> NonZeroU64 {
     nonzero(10).into()
 }

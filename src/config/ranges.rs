@@ -45,6 +45,9 @@ const STEPS: f64 = 1e12;
 const FEMTOSECONDS: &str = "it is in fs: 1 ps is 1000 fs";
 const PER_FEMTOSECOND: &str = "it is in 1/fs: 1/ps is 0.001/fs";
 const RELATIVE_VOLUME: &str = "it is V/V₀ and no percentage: +40 % is 1.4";
+const RELATIVE_DRIFT: &str = "it is V/V₀ and no percentage: 1 % is 0.01";
+const BAR: &str = "it is in bar: 1 GPa is 10000 bar";
+const GAIN: &str = "it is the bias as a part of the bulk modulus: 0.005 to 0.1";
 const TAU: &str = "it is the bias as a part of the force: 0.15 to 2";
 const CUTOFF: &str = "it is in eV: 1 Ry is 13.6 eV, 1 Ha is 27.2 eV";
 const K_SPACING: &str = "it is in 1/Å with 2π included: the paper's is 0.125";
@@ -67,7 +70,7 @@ const fn range(
 }
 
 /// All ranges, by table.
-pub static RANGES: [Range; 116] = [
+pub static RANGES: [Range; 127] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -79,6 +82,17 @@ pub static RANGES: [Range; 116] = [
     range("walk.thermostat.nose_hoover.chain_length", "", [1.0, 100.0], [1.0, 10.0], ""),
     range("walk.volume_ramp.from", "V/V₀", [0.05, 20.0], [0.4, 3.0], RELATIVE_VOLUME),
     range("walk.volume_ramp.to", "V/V₀", [0.05, 20.0], [0.4, 3.0], RELATIVE_VOLUME),
+    range("walk.barostat.pressure", "bar", [-1e7, 1e7], [-1e5, 1e6], BAR),
+    range("walk.barostat.relaxation_time", "fs", [0.0, 1e6], [100.0, 1e4], FEMTOSECONDS),
+    range("walk.reference_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
+    range("walk.start_volume", "V/V₀", [0.05, 20.0], [0.4, 3.0], RELATIVE_VOLUME),
+    range("walk.cell_bias.stress_scale", "GPa", [0.0, 1e5], [0.1, 1e3], "it is in GPa: 1 eV/Å³ is 160 GPa"),
+    range("walk.cell_bias.gain", "", [0.0, 10.0], [1e-4, 0.5], GAIN),
+    range("walk.cell_bias.window", "", [2.0, STEPS], [100.0, 1e5], ""),
+    range("walk.cell_bias.min_drift", "V/V₀", [0.0, 10.0], [1e-4, 0.2], RELATIVE_DRIFT),
+    range("walk.cell_bias.max_drift", "V/V₀", [0.0, 10.0], [1e-3, 0.5], RELATIVE_DRIFT),
+    range("walk.cell_bias.end_after_collected", "", [0.0, 1e9], [0.0, 1e4], ""),
+    range("walk.cell_bias.end_after_contacts", "", [1.0, 1e9], [1.0, 1e3], ""),
     range("walk.bias_averaging_steps", "", [0.0, STEPS], [1.0, 1e3], ""),
     range("walk.skin", "Å", [0.0, 10.0], [0.05, 3.0], ""),
     range("calm.max_mean_square_growth", "", [1.0, 1e6], [1.5, 100.0], ""),
@@ -220,7 +234,7 @@ impl Range {
     fn possible_in_words(&self) -> String {
         let [least, most] = self.possible.map(|bound| self.shown(bound));
         let bounds =
-            if self.possible[0] > 0.0 { format!("{least} to {most}") } else { format!("at most {most}") };
+            if self.possible[0] != 0.0 { format!("{least} to {most}") } else { format!("at most {most}") };
         self.with_unit(bounds)
     }
 

@@ -32,6 +32,7 @@ fn every_status_word_is_explained() {
         WalkEnd::Budget,
         WalkEnd::Superseded,
         WalkEnd::NothingNew,
+        WalkEnd::VolumeBoundary,
         WalkEnd::Trapped { guard: none() },
         WalkEnd::Diverged { reason: none() },
         WalkEnd::InvalidStart { reason: none() },

@@ -2,11 +2,14 @@
 //!
 //! F_i^HAL = F_i^phys + τ_r ∇_i 𝒰, 𝒰 = Σ_j γ_j, τ_r = τ Σ_i‖F_i^phys‖ / Σ_i‖∇_i 𝒰‖, both sums exponentially
 //! averaged (paper, Eq. hal-force). Energy and grade share one forward pass and one reverse sweep. A switched ZBL
-//! repulsion is added after the biased force and virial, so it does not enter τ_r.
+//! repulsion is added with its virial after the biased force, so it does not enter τ_r.
+//!
+//! The bias does not enter the virial: the cell has a bias of its own, along the direction of ∂𝒰/∂ε, which is averaged
+//! here ([`crate::cell_bias`]).
 
 use std::sync::Arc;
 
-use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, Vec3, cell};
+use atoms::{Evaluation, Matrix3, NeighbourList, Potential, PotentialError, Species, Structure, Vec3, cell};
 use calm::{BatchedGrades, GradeError, Grades, Mixture};
 use potentials::grace::PullBack;
 use potentials::{PotentialWithFeatures, Zbl};
@@ -21,19 +24,31 @@ pub struct BiasState {
     pub force_norm: f64,
     /// Running average of Σ‖∇𝒰‖, 1/Å.
     pub gradient_norm: f64,
+    /// Running average of the unit direction of ∂𝒰/∂ε.
+    pub strain_direction: Matrix3,
 }
 
 impl BiasState {
-    /// Adds one step's sums to the averages and returns τ_r / τ, eV. The averages start at the first values. The
-    /// bias is zero for the first `steps` evaluations, while they settle.
-    fn advance(&mut self, force_norm: f64, gradient_norm: f64, steps: u64) -> f64 {
+    /// Adds one step's sums and ∂𝒰/∂ε to the averages and returns τ_r / τ, eV. The averages start at the first values.
+    /// The bias is zero for the first `steps` evaluations, while they settle.
+    fn advance(&mut self, force_norm: f64, gradient_norm: f64, strain: &Matrix3, steps: u64) -> f64 {
         let weight = if self.evaluations == 0 { 1.0 } else { 1.0 / steps.max(1) as f64 };
         self.force_norm += weight * (force_norm - self.force_norm);
         self.gradient_norm += weight * (gradient_norm - self.gradient_norm);
+        let direction = unit(strain);
+        for (mean, new) in self.strain_direction.iter_mut().flatten().zip(direction.as_flattened()) {
+            *mean += weight * (new - *mean);
+        }
         self.evaluations += 1;
         let silent = self.evaluations <= steps || self.gradient_norm <= 0.0;
         if silent { 0.0 } else { self.force_norm / self.gradient_norm }
     }
+}
+
+/// A tensor divided by its Frobenius norm; zero stays zero.
+fn unit(tensor: &Matrix3) -> Matrix3 {
+    let norm = tensor.iter().flatten().map(|x| x * x).sum::<f64>().sqrt();
+    if norm > 0.0 { tensor.map(|row| row.map(|x| x / norm)) } else { Matrix3::default() }
 }
 
 /// Why a structure has no grades.
@@ -99,6 +114,19 @@ impl BiasedPotential {
         &self.physical
     }
 
+    /// ∂𝒰/∂ε at the last evaluation with the bias on, symmetric.
+    pub fn strain_derivative(&self) -> &Matrix3 {
+        &self.pull_back.virial
+    }
+
+    /// σ_bias = −`stress` Ŵ, eV/Å³, tension positive, for `stress` = τ_s B. Zero as long as the bias on the forces is.
+    pub fn cell_stress(&self, stress: f64) -> Matrix3 {
+        if self.tau == 0.0 || self.state.evaluations <= self.bias_averaging_steps {
+            return Matrix3::default();
+        }
+        unit(&self.state.strain_direction).map(|row| row.map(|x| -stress * x))
+    }
+
     /// Features of the atoms that [`BiasedPotential::grades`] graded, [n × D].
     pub fn features(&self) -> &[f64] {
         self.potential.features()
@@ -149,12 +177,10 @@ impl BiasedPotential {
     fn add_bias(&mut self, out: &mut Evaluation) {
         let norm = |vectors: &[Vec3]| vectors.iter().map(|v| cell::norm(*v)).sum::<f64>();
         let (force_norm, gradient_norm) = (norm(&out.forces), norm(&self.pull_back.gradient));
-        let scale = self.tau * self.state.advance(force_norm, gradient_norm, self.bias_averaging_steps);
+        let (strain, steps) = (&self.pull_back.virial, self.bias_averaging_steps);
+        let scale = self.tau * self.state.advance(force_norm, gradient_norm, strain, steps);
         for (force, gradient) in out.forces.iter_mut().zip(&self.pull_back.gradient) {
             *force = cell::add(*force, cell::scale(*gradient, scale));
-        }
-        for (w, u) in out.virial.iter_mut().flatten().zip(self.pull_back.virial.iter().flatten()) {
-            *w += scale * u;
         }
     }
 }

@@ -3,6 +3,7 @@
 
 pub mod agent;
 pub mod bias;
+pub mod cell_bias;
 pub mod guard;
 pub mod labeller;
 pub mod settings;

@@ -1,8 +1,11 @@
 //! Settings of walks.
 
 use atoms::MinDistanceRule;
+use md::BarostatSettings;
 use potentials::ZblWindows;
 use serde::{Deserialize, Serialize};
+
+use crate::cell_bias::CellBiasSettings;
 
 /// Dynamics, bias and guards of every walk of a campaign. What differs between walks is in their conditions
 /// ([`wire::WalkConditions`]).
@@ -14,12 +17,18 @@ pub struct WalkSettings {
     pub thermostat: md::ThermostatSettings,
     /// Time step, fs; `None` for the paper's rule (2 fs; 0.5 fs with H, He, Li or Be).
     pub time_step: Option<f64>,
-    /// Unbiased steps at the start, at the volume at which the ramp starts.
+    /// Unbiased steps at the start, at the volume at which the walk starts.
     pub equilibration_steps: u64,
     /// Biased steps after equilibration.
     pub biased_steps: u64,
     /// Steps over which the two norms of τ_r are exponentially averaged.
     pub bias_averaging_steps: u64,
+    /// Barostat of walks at constant pressure, whose pressure is in their conditions.
+    pub barostat: BarostatSettings,
+    /// Steps of the reference run of walks at constant pressure; 0 for none.
+    pub reference_steps: u64,
+    /// Bias on the cell of walks at constant pressure that have one.
+    pub cell_bias: CellBiasSettings,
     /// Neighbour-list skin, Å.
     pub skin: f64,
     /// When a structure becomes a candidate.

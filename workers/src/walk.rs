@@ -4,6 +4,7 @@
 //! report, on any walker and any number of times.
 
 mod candidate;
+mod constant_pressure;
 mod error;
 mod state;
 
@@ -18,10 +19,11 @@ use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd, Wa
 use wire::{Candidate, Origin};
 
 use crate::bias::{BiasedPotential, UngradedError};
+use crate::cell_bias::CellBias;
 use crate::guard;
 use crate::settings::WalkSettings;
 use error::WalkError;
-use state::{CollectionPoint, WalkState, start};
+use state::{CollectionPoint, GoodState, WalkState, start};
 
 /// Data shared by every walk of a campaign.
 #[derive(Clone)]
@@ -154,8 +156,14 @@ impl<'a> RunningWalk<'a> {
         stopping: &impl Fn() -> bool,
         on_progress: &impl Fn(WalkProgress),
     ) -> Result<Outcome<Candidate>, WalkError> {
+        if let Some(interrupted) = self.finish_reference_run(stopping, on_progress)? {
+            return Ok(interrupted);
+        }
         let last = self.settings.equilibration_steps + self.settings.biased_steps;
         loop {
+            if self.is_at_volume_boundary() {
+                return Ok(Outcome::Ended(WalkEnd::VolumeBoundary));
+            }
             if self.step() >= last {
                 return Ok(Outcome::Ended(WalkEnd::Completed));
             }
@@ -173,8 +181,9 @@ impl<'a> RunningWalk<'a> {
         }
     }
 
+    /// Steps since the start of the walk, to which a reference run does not belong.
     fn step(&self) -> u64 {
-        self.dynamics.state().step
+        if self.state.reference_run.is_some() { 0 } else { self.dynamics.state().step }
     }
 
     fn is_control(&self) -> bool {
@@ -184,7 +193,19 @@ impl<'a> RunningWalk<'a> {
     fn advance_one_step(&mut self) -> Result<(), WalkError> {
         let equilibrated = self.step() >= self.settings.equilibration_steps;
         self.potential.tau = if equilibrated { self.state.tau } else { 0.0 };
-        self.dynamics.step(&mut self.potential)?;
+        if equilibrated {
+            self.release_cell()?;
+        }
+        let stress = self.state.cell_bias.as_ref().map_or(0.0, CellBias::stress);
+        let reflections = self.reflections();
+        self.dynamics.step_with_bias_stress(&mut self.potential, |bias, _| bias.cell_stress(stress))?;
+        if equilibrated {
+            self.observe_cell(reflections);
+        }
+        self.check_step()
+    }
+
+    fn check_step(&self) -> Result<(), WalkError> {
         let (structure, neighbours) = (self.dynamics.structure(), self.dynamics.neighbours());
         let (evaluation, temperature) = (self.dynamics.evaluation(), self.dynamics.temperature());
         match guard::blown_up(&self.settings.guard, structure, neighbours, evaluation, temperature) {
@@ -233,7 +254,7 @@ impl<'a> RunningWalk<'a> {
     }
 
     fn save_checkpoint(&mut self) {
-        self.state.keep_checkpoint(self.dynamics.checkpoint(), self.potential.state);
+        self.state.keep_checkpoint(&self.dynamics, &self.potential);
     }
 
     /// Counts a refusal by the shortest-bond guard. After too many in a row the walk rolls back, or ends.
@@ -254,7 +275,7 @@ impl<'a> RunningWalk<'a> {
 
     /// Rolls back to the oldest good checkpoint as a new segment, with smaller τ and new random numbers.
     fn roll_back(&mut self) -> Result<(), WalkError> {
-        let (mut checkpoint, bias) = self.state.good.swap_remove(0);
+        let GoodState { dynamics: mut checkpoint, bias, cell_bias } = self.state.good.swap_remove(0);
         self.state.good.clear();
         self.state.segment += 1;
         self.state.rollbacks += 1;
@@ -265,6 +286,7 @@ impl<'a> RunningWalk<'a> {
         self.state.last_rollback = Some((self.step(), checkpoint.state.step));
         self.dynamics = Dynamics::resume(checkpoint, cutoff, self.settings.skin)?;
         self.potential.state = bias;
+        self.state.cell_bias = cell_bias;
         self.state.next_offer = self.state.offer_after_rollback(self.step(), self.settings);
         self.save_checkpoint();
         Ok(())
@@ -275,12 +297,14 @@ impl<'a> RunningWalk<'a> {
     }
 
     fn relative_volume(&self) -> f64 {
-        let ramp = self
-            .dynamics
-            .checkpoint()
-            .cell_motion
-            .ramp()
-            .filter(|_| self.dynamics.structure().periodic != [false; 3]);
+        let structure = self.dynamics.structure();
+        if structure.periodic == [false; 3] {
+            return 1.0;
+        }
+        if self.assignment.conditions.constant_pressure.is_some() {
+            return md::extent(structure) / self.state.reference_volume;
+        }
+        let ramp = self.dynamics.checkpoint().cell_motion.ramp();
         ramp.map_or(1.0, |ramp| ramp.relative_volume(self.step()))
     }
 

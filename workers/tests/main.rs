@@ -6,6 +6,7 @@ mod common;
 mod mutate;
 
 mod calculations;
+mod constant_pressure;
 mod deep_models;
 mod labeller;
 mod walk;

@@ -8,12 +8,13 @@ use atoms::{
     Evaluation, MinDistanceRule, NeighbourList, Potential, Structure, Uniform, Vec3, cell, read_extxyz,
 };
 use calm::{Artifact, CollectionRule, Grades, Mixture};
-use md::{LangevinSettings, ThermostatSettings};
+use md::{BarostatSettings, LangevinSettings, ThermostatSettings};
 use potentials::grace::{Grace, GraceModel, PullBack, Threads};
 use potentials::{ZblWindow, ZblWindows};
 use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd};
 use wire::{CampaignId, Candidate, Origin, WalkConditions, WalkId};
 use workers::bias::BiasedPotential;
+use workers::cell_bias::CellBiasSettings;
 use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
 
@@ -23,16 +24,16 @@ fn data(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/data").join(path)
 }
 
-fn seed_structure(name: &str) -> Structure {
+pub fn seed_structure(name: &str) -> Structure {
     let frames = read_extxyz(&data("aluminium_seeds.extxyz")).unwrap();
     frames.into_iter().find(|frame| frame.info["name"].text() == Some(name)).unwrap().structure
 }
 
-fn model() -> Arc<GraceModel> {
+pub fn model() -> Arc<GraceModel> {
     Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap())
 }
 
-fn mixture() -> Arc<Mixture> {
+pub fn mixture() -> Arc<Mixture> {
     Arc::new(Artifact::load(data("al_eam_1l/gmm_artifacts.npz")).unwrap().mixture)
 }
 
@@ -40,7 +41,7 @@ fn uniform_zbl(inner: f64, outer: f64) -> Option<ZblWindows> {
     Some(ZblWindows::Uniform(ZblWindow { inner, outer }))
 }
 
-fn settings() -> WalkSettings {
+pub fn settings() -> WalkSettings {
     WalkSettings {
         rng_seed: 3,
         thermostat: ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 }),
@@ -48,6 +49,9 @@ fn settings() -> WalkSettings {
         equilibration_steps: 20,
         biased_steps: 600,
         bias_averaging_steps: 10,
+        barostat: BarostatSettings::default(),
+        reference_steps: 0,
+        cell_bias: CellBiasSettings::default(),
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'").unwrap(),
         min_interval: 200,
@@ -74,7 +78,7 @@ fn conditions() -> WalkConditions {
     }
 }
 
-fn assignment(structure: Structure, until: u64) -> Assignment {
+pub fn assignment(structure: Structure, until: u64) -> Assignment {
     Assignment {
         campaign: CampaignId([1; 16]),
         walk: WalkId(0),
@@ -91,7 +95,7 @@ fn assignment(structure: Structure, until: u64) -> Assignment {
     }
 }
 
-fn run(settings: &WalkSettings, assignment: &Assignment) -> AssignmentReport<Candidate> {
+pub fn run(settings: &WalkSettings, assignment: &Assignment) -> AssignmentReport<Candidate> {
     let context =
         WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings.clone()) };
     advance(&context, assignment, mixture(), || false, |_| {}).unwrap()
@@ -103,7 +107,7 @@ fn first_of(seed: &str, conditions: WalkConditions) -> Assignment {
 }
 
 /// Runs a walk, one assignment as long as the first after the other, with every candidate accepted, until it ends.
-fn whole_walk(settings: &WalkSettings, first: Assignment) -> Vec<AssignmentReport<Candidate>> {
+pub fn whole_walk(settings: &WalkSettings, first: Assignment) -> Vec<AssignmentReport<Candidate>> {
     let steps_per_assignment = first.last_step;
     let mut next = first;
     let mut reports = Vec::new();
@@ -175,7 +179,7 @@ fn damaged_checkpoints_do_not_stop_a_walker() {
     assert!(refused > 0);
 }
 
-fn never() -> CollectionRule {
+pub fn never() -> CollectionRule {
     toml::from_str("rule = 'maximum_grade'\nthreshold = 1e9").unwrap()
 }
 

@@ -127,6 +127,15 @@ impl Dynamics {
         self.now.validate()
     }
 
+    /// Lets the cell move in another way from the next step on.
+    ///
+    /// # Errors
+    /// The motion has impossible settings.
+    pub fn set_cell_motion(&mut self, motion: CellMotion) -> Result<(), DynamicsError> {
+        self.now.cell_motion = motion;
+        self.now.validate()
+    }
+
     /// The state from which the run can resume.
     pub fn checkpoint(&self) -> &Checkpoint {
         &self.now

@@ -10,6 +10,7 @@
 
 mod barostat;
 mod barostat_settings;
+mod bulk_modulus;
 mod cell_freedom;
 mod cell_motion;
 mod checkpoint;
@@ -29,6 +30,7 @@ mod wrong_setting;
 
 pub use barostat::{Barostat, CellThermostat};
 pub use barostat_settings::{BAR_PER_EV_A3, BarostatSettings};
+pub use bulk_modulus::bulk_modulus;
 pub use cell_freedom::CellFreedom;
 pub use cell_motion::CellMotion;
 pub use checkpoint::Checkpoint;
@@ -41,5 +43,5 @@ pub use random::{Stream, StreamId, philox};
 pub use state::{State, kinetic_energy, kinetic_tensor, masses, maxwell_boltzmann, momentum, temperature};
 pub use thermostat::{Thermostat, ThermostatSettings};
 pub use velocity_rescaling::{VelocityRescaling, VelocityRescalingSettings};
-pub use volume_ramp::{VolumeRamp, scale_volume};
+pub use volume_ramp::{VolumeRamp, extent, scale_volume};
 pub use wrong_setting::WrongSetting;

@@ -68,8 +68,8 @@ pub fn scale_volume(structure: &mut Structure, ratio: f64) {
     }
 }
 
-/// Volume, area or length of the periodic directions; 1 for a cluster.
-pub(crate) fn extent(structure: &Structure) -> f64 {
+/// Volume (Å³), area (Å²) or length (Å) of the periodic directions; 1 for a cluster.
+pub fn extent(structure: &Structure) -> f64 {
     structure.cell.completed(structure.periodic).volume()
 }
 

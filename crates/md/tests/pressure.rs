@@ -7,7 +7,8 @@ use md::{
 };
 
 use crate::common::{
-    IdealGas, argon_crystal, crystal, log_odds_slope, mean_and_variance, settings, warm_argon, with_barostat,
+    IdealGas, LennardJones, argon_crystal, crystal, log_odds_slope, mean_and_variance, settings, warm_argon,
+    with_barostat,
 };
 
 fn within_five_errors(what: &str, [found, error]: [f64; 2], expected: f64, scale: f64) {
@@ -188,6 +189,25 @@ fn volumes_at_two_pressures_have_the_boltzmann_ratio() {
         assert!(error < 0.15 * expected, "{slope} ± {error} 1/Å³");
         assert!((slope - expected).abs() < 5.0 * error, "{slope} ± {error} 1/Å³, expected {expected}");
     }
+}
+
+/// B = V d²E/dV² is −V dP/dV without motion.
+#[test]
+fn the_bulk_modulus_is_the_derivative_of_the_pressure() {
+    let mut potential = LennardJones::argon();
+    let crystal = argon_crystal(3);
+    let pressures = [0.999, 1.001].map(|ratio| {
+        let mut structure = crystal.clone();
+        md::scale_volume(&mut structure, ratio);
+        let at_rest = State { velocities: vec![[0.0; 3]; structure.len()], structure, step: 0 };
+        let tensor = Dynamics::new(at_rest, settings(4.0, Thermostat::None), &mut potential)
+            .unwrap()
+            .pressure_tensor();
+        tensor.unwrap()[0][0]
+    });
+    let expected = (pressures[0] - pressures[1]) / 0.002;
+    let found = md::bulk_modulus(&crystal, &mut potential).unwrap();
+    assert!((found / expected - 1.0).abs() < 0.01, "{found} eV/Å³, from the pressure {expected}");
 }
 
 /// The isothermal bulk modulus from the fluctuations of the volume, k_B T ⟨V⟩ / ⟨(V − ⟨V⟩)²⟩, is that of the mean

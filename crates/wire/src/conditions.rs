@@ -11,13 +11,27 @@ pub struct WalkConditions {
     pub temperature: f64,
     /// Uncertainty-force scale τ at the start of the walk.
     pub tau: f64,
-    /// V/V₀ at the first and at the last biased step; `None` for a fixed cell.
+    /// V/V₀ at the first and at the last biased step; `None` for a fixed cell or one at constant pressure.
     pub volume_ramp: Option<(f64, f64)>,
+    /// What a walk at constant pressure starts from; `None` at constant volume or with a volume ramp.
+    #[serde(default)]
+    pub constant_pressure: Option<ConstantPressure>,
     /// Number of the walk among those under the same conditions, from 0. They differ in their random numbers.
     pub repeat: u32,
     /// Version of the potential that drives it: 0 is that of the configuration.
     #[serde(default)]
     pub version: u32,
+}
+
+/// The conditions of a walk at constant pressure.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ConstantPressure {
+    /// Pressure, bar.
+    pub pressure: f64,
+    /// V/V₀ at its first step.
+    pub start_volume: f64,
+    /// Whether its cell is biased.
+    pub cell_bias: bool,
 }
 
 /// Which conditions differ between the walks of a campaign.
@@ -26,7 +40,7 @@ pub struct VariedConditions {
     group: bool,
     temperature: bool,
     tau: bool,
-    volume_ramp: bool,
+    cell: bool,
     repeat: bool,
     version: bool,
 }
@@ -40,7 +54,7 @@ impl VariedConditions {
             group: varied.group || other.group != first.group,
             temperature: varied.temperature || other.temperature != first.temperature,
             tau: varied.tau || other.tau != first.tau,
-            volume_ramp: varied.volume_ramp || other.volume_ramp != first.volume_ramp,
+            cell: varied.cell || other.cell() != first.cell(),
             repeat: varied.repeat || other.repeat != first.repeat,
             version: varied.version || other.version != first.version,
         })
@@ -48,14 +62,10 @@ impl VariedConditions {
 
     /// What distinguishes a walk, as text: `hot, 600 K, V 1 to 1.4, τ 0.15, #2, version 1`. Empty if nothing varies.
     pub fn describe(&self, walk: &WalkConditions) -> String {
-        let ramp = match walk.volume_ramp {
-            Some((from, to)) => format!("V {from} to {to}"),
-            None => "fixed cell".to_owned(),
-        };
         let parts = [
             (self.group, walk.group.clone()),
             (self.temperature, format!("{} K", walk.temperature)),
-            (self.volume_ramp, ramp),
+            (self.cell, walk.cell_in_words()),
             (self.tau, format!("τ {}", walk.tau)),
             (self.repeat, format!("#{}", walk.repeat + 1)),
             (self.version, format!("version {}", walk.version)),
@@ -76,7 +86,25 @@ impl VariedConditions {
 impl WalkConditions {
     /// Whether the volume changes.
     pub fn changes_volume(&self) -> bool {
-        self.volume_ramp.is_some_and(|(from, to)| from != 1.0 || to != 1.0)
+        let ramp = self.volume_ramp.is_some_and(|(from, to)| from != 1.0 || to != 1.0);
+        ramp || self.constant_pressure.is_some()
+    }
+
+    /// What the cell does: `fixed cell`, `V 1 to 1.4`, `1 bar`, `1 bar from V 0.94, biased cell`.
+    pub fn cell_in_words(&self) -> String {
+        match (self.constant_pressure, self.volume_ramp) {
+            (Some(ConstantPressure { pressure, start_volume, cell_bias }), _) => {
+                let start =
+                    if start_volume == 1.0 { String::new() } else { format!(" from V {start_volume}") };
+                format!("{pressure} bar{start}{}", if cell_bias { ", biased cell" } else { "" })
+            }
+            (None, Some((from, to))) => format!("V {from} to {to}"),
+            (None, None) => "fixed cell".to_owned(),
+        }
+    }
+
+    fn cell(&self) -> (Option<(f64, f64)>, Option<ConstantPressure>) {
+        (self.volume_ramp, self.constant_pressure)
     }
 }
 
@@ -90,6 +118,7 @@ mod tests {
             temperature,
             tau: 0.15,
             volume_ramp: Some((1.0, 1.4)),
+            constant_pressure: None,
             repeat,
             version: 0,
         }
@@ -108,6 +137,10 @@ mod tests {
         let varied = VariedConditions::among([&walks[0], &other]);
         assert_eq!(varied.name("fcc", &walks[0]), "fcc (hot, V 1 to 1.4, τ 0.15)");
         assert_eq!(varied.name("fcc", &other), "fcc (cold, fixed cell, τ 0.3)");
+        let constant_pressure = ConstantPressure { pressure: 1.0, start_volume: 0.94, cell_bias: true };
+        let pressed = WalkConditions { constant_pressure: Some(constant_pressure), ..other.clone() };
+        let varied = VariedConditions::among([&other, &pressed]);
+        assert_eq!(varied.describe(&pressed), "1 bar from V 0.94, biased cell");
         let later = WalkConditions { version: 2, ..walks[0].clone() };
         assert_eq!(VariedConditions::among([&walks[0], &later]).describe(&later), "version 2");
     }

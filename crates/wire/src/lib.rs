@@ -22,7 +22,7 @@ pub mod transport;
 
 pub use block::{BlockError, Candidate, CandidateBlock, CandidateView};
 pub use completion::{CompletionCoefficients, CompletionPredictors};
-pub use conditions::WalkConditions;
+pub use conditions::{ConstantPressure, WalkConditions};
 pub use device_statistics::DeviceStatistics;
 pub use ids::{CampaignId, CandidateId, ContentHash, IdError, Origin, WalkId};
 pub use mixture::{MixtureReader, SharedMixture, SharedMixtureError};

@@ -124,6 +124,8 @@ pub enum WalkEnd {
     Superseded,
     /// The biased walks together made their maximum number of steps without a new structure.
     NothingNew,
+    /// It has collected enough and touches a boundary of its volume again and again.
+    VolumeBoundary,
     /// A guard rejected it too often, after the allowed number of rollbacks.
     Trapped {
         /// Name of the guard.
@@ -142,8 +144,8 @@ pub enum WalkEnd {
 }
 
 impl WalkEnd {
-    /// The serialized name: `"completed"`, `"quota_reached"`, `"budget"`, `"superseded"`, `"nothing_new"`, `"trapped"`,
-    /// `"diverged"` or `"invalid_start"`.
+    /// The serialized name: `"completed"`, `"quota_reached"`, `"budget"`, `"superseded"`, `"nothing_new"`, `"volume_boundary"`,
+    /// `"trapped"`, `"diverged"` or `"invalid_start"`.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Completed => "completed",
@@ -151,6 +153,7 @@ impl WalkEnd {
             Self::Budget => "budget",
             Self::Superseded => "superseded",
             Self::NothingNew => "nothing_new",
+            Self::VolumeBoundary => "volume_boundary",
             Self::Trapped { .. } => "trapped",
             Self::Diverged { .. } => "diverged",
             Self::InvalidStart { .. } => "invalid_start",

@@ -450,7 +450,8 @@ fn describe_end(end: &WalkEnd) -> String {
         | WalkEnd::QuotaReached
         | WalkEnd::Budget
         | WalkEnd::Superseded
-        | WalkEnd::NothingNew => String::new(),
+        | WalkEnd::NothingNew
+        | WalkEnd::VolumeBoundary => String::new(),
         WalkEnd::Trapped { guard } => format!("rejected by the {guard} guard again and again"),
         WalkEnd::Diverged { reason } | WalkEnd::InvalidStart { reason } => reason.clone(),
     }

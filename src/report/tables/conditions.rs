@@ -13,8 +13,7 @@ pub fn conditions(data: &ReportData) -> PageTable {
     let mut titles = vec![
         "group",
         "T (K)",
-        "V/V_{0} from",
-        "to",
+        "cell",
         "τ",
         "walks",
         "ended",
@@ -23,7 +22,7 @@ pub fn conditions(data: &ReportData) -> PageTable {
         "rejected",
         "roll-backs",
     ];
-    let caption = "Results by the conditions of biased walks: temperature of the thermostat, volume ramp and τ at the start; accepted \
+    let caption = "Results by the conditions of biased walks: temperature of the thermostat, volume or pressure, and τ at the start; accepted \
                    structures, structures rejected by the guard, and roll-backs to a checkpoint.";
     let all = by_conditions(&data.status.walks);
     let has_versions = all.iter().any(|(conditions, _)| conditions.version > 0);
@@ -32,12 +31,10 @@ pub fn conditions(data: &ReportData) -> PageTable {
     for (conditions, walks) in all.iter().filter(|_| all.len() > 1) {
         let sum = |of: fn(&WalkStatus) -> u64| walks.iter().map(|walk| of(walk)).sum::<u64>();
         let (accepted, number) = (sum(|walk| walk.accepted.into()), walks.len() as u64);
-        let (from, to) = conditions.volume_ramp.unwrap_or((1.0, 1.0));
         let mut row = vec![
             text(&conditions.group),
             real(conditions.temperature, 0),
-            real(from, 2),
-            real(to, 2),
+            text(conditions.cell_in_words()),
             real(conditions.tau, 3),
             count(number),
             text(states(walks.iter().copied()).1),
@@ -58,10 +55,9 @@ fn by_conditions(walks: &[WalkStatus]) -> Vec<(WalkConditions, Vec<&WalkStatus>)
     let mut places = HashMap::new();
     for walk in walks.iter().filter(|walk| walk.origin == "biased") {
         let Some(conditions) = &walk.conditions else { continue };
-        let WalkConditions { group, temperature, tau, volume_ramp, repeat: _, version } = conditions;
+        let WalkConditions { group, temperature, tau, version, .. } = conditions;
         // Numbers have no hash, their bits have.
-        let ramp = volume_ramp.map(|(from, to)| (from.to_bits(), to.to_bits()));
-        let key = (group, temperature.to_bits(), tau.to_bits(), ramp, version);
+        let key = (group, temperature.to_bits(), tau.to_bits(), conditions.cell_in_words(), version);
         let place = *places.entry(key).or_insert(all.len());
         if place == all.len() {
             all.push((WalkConditions { repeat: 0, ..conditions.clone() }, Vec::new()));

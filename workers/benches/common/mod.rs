@@ -5,11 +5,12 @@ use std::time::Instant;
 
 use atoms::{Cell, MinDistanceRule, Species, Structure, Uniform};
 use calm::Mixture;
-use md::{LangevinSettings, ThermostatSettings};
+use md::{BarostatSettings, LangevinSettings, ThermostatSettings};
 use potentials::grace::{GraceModel, Threads};
 use potentials::{ZblWindow, ZblWindows};
 use wire::messages::{Assignment, AssignmentReport, Outcome};
 use wire::{CampaignId, Candidate, Origin, WalkConditions, WalkId};
+use workers::cell_bias::CellBiasSettings;
 use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
 
@@ -76,6 +77,9 @@ fn settings(threshold: f64) -> WalkSettings {
         equilibration_steps: EQUILIBRATION,
         biased_steps: 10_000_000,
         bias_averaging_steps: 10,
+        barostat: BarostatSettings::default(),
+        reference_steps: 0,
+        cell_bias: CellBiasSettings::default(),
         skin: 0.5,
         collection: toml::from_str(&format!("rule = 'maximum_grade'\nthreshold = {threshold:e}"))
             .expect("a rule"),

@@ -24,6 +24,10 @@ pub(super) enum WalkError {
     Zbl(#[from] ZblRangeError),
     #[error("the walk's checkpoint cannot be read: {0}")]
     Checkpoint(#[from] postcard::Error),
+    #[error(
+        "the bulk modulus of the seed structure is {0:.1} GPa: it is not stable; give walk.cell_bias.stress_scale"
+    )]
+    BulkModulus(f64),
     #[error("{0}")]
     Diverged(String),
 }

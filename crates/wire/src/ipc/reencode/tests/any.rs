@@ -9,7 +9,7 @@ use proptest::prelude::*;
 use super::common::{candidate, origin, usable_structure};
 use super::encode_message;
 use crate::block::Candidate;
-use crate::conditions::WalkConditions;
+use crate::conditions::{ConstantPressure, WalkConditions};
 use crate::ids::{CampaignId, Origin, WalkId};
 use crate::messages::{Assignment, AssignmentReport, DeclineReason, Outcome, Verdict, WalkEnd, WalkProgress};
 use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
@@ -24,6 +24,7 @@ fn verdict() -> impl Strategy<Value = Verdict> {
 fn end() -> impl Strategy<Value = WalkEnd> {
     prop_oneof![
         Just(WalkEnd::Completed),
+        Just(WalkEnd::VolumeBoundary),
         Just(WalkEnd::QuotaReached),
         Just(WalkEnd::Budget),
         Just(WalkEnd::Superseded),
@@ -94,12 +95,19 @@ pub fn assignment() -> impl Strategy<Value = Assignment> {
 
 fn conditions() -> impl Strategy<Value = WalkConditions> {
     let ramp = option::of((0.1..9.0, 0.1..9.0));
-    ("[a-z]{0,9}", 1.0..9000.0, 0.0..9.0, ramp, any::<u32>(), any::<u32>()).prop_map(
-        |(group, temperature, tau, volume_ramp, repeat, version)| WalkConditions {
+    let pressure = (-1e5..1e5, 0.1..9.0, any::<bool>());
+    let pressure = option::of(pressure.prop_map(|(pressure, start_volume, cell_bias)| ConstantPressure {
+        pressure,
+        start_volume,
+        cell_bias,
+    }));
+    ("[a-z]{0,9}", 1.0..9000.0, 0.0..9.0, ramp, pressure, any::<u32>(), any::<u32>()).prop_map(
+        |(group, temperature, tau, volume_ramp, constant_pressure, repeat, version)| WalkConditions {
             group,
             temperature,
             tau,
             volume_ramp,
+            constant_pressure,
             repeat,
             version,
         },
