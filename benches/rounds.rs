@@ -189,6 +189,7 @@ fn walk_settings() -> WalkSettings {
         equilibration_steps: 500,
         biased_steps: 2000,
         bias_averaging_steps: 10,
+        trace_interval: 50,
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nmin_atoms = 3")
             .unwrap(),

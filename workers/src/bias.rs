@@ -4,13 +4,17 @@
 //! averaged (paper, Eq. hal-force). Energy and grade share one forward pass and one reverse sweep. A switched ZBL
 //! repulsion is added after the biased force and virial, so it does not enter τ_r.
 
+mod work;
+
 use std::sync::Arc;
 
-use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, Vec3, cell};
+use atoms::{Evaluation, Matrix3, NeighbourList, Potential, PotentialError, Species, Structure, Vec3, cell};
 use calm::{BatchedGrades, GradeError, Grades, Mixture};
 use potentials::grace::PullBack;
 use potentials::{PotentialWithFeatures, Zbl};
 use serde::{Deserialize, Serialize};
+
+pub use work::BiasWork;
 
 /// State of the bias, part of a walk's checkpoint.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -21,6 +25,8 @@ pub struct BiasState {
     pub force_norm: f64,
     /// Running average of Σ‖∇𝒰‖, 1/Å.
     pub gradient_norm: f64,
+    /// Work of the bias so far.
+    pub work: BiasWork,
 }
 
 impl BiasState {
@@ -58,6 +64,8 @@ pub struct BiasedPotential {
     /// State of the running averages.
     pub state: BiasState,
     bias_averaging_steps: u64,
+    /// τ_r at the last evaluation, eV.
+    scale: f64,
     pull_back: PullBack,
     /// With the bias on.
     parts: BatchedGrades,
@@ -87,6 +95,7 @@ impl BiasedPotential {
             tau: 0.0,
             state: BiasState::default(),
             bias_averaging_steps,
+            scale: 0.0,
             pull_back: PullBack::default(),
             parts: BatchedGrades::default(),
             grades: Grades::default(),
@@ -97,6 +106,35 @@ impl BiasedPotential {
     /// Energy, forces and virial of the potential alone at the last evaluation.
     pub fn physical(&self) -> &Evaluation {
         &self.physical
+    }
+
+    /// τ_r at the last evaluation, eV.
+    pub fn bias_scale(&self) -> f64 {
+        self.scale
+    }
+
+    /// Σ‖τ_r ∇𝒰‖ / Σ‖F^phys‖ at the last evaluation; 0 without bias, and without forces.
+    pub fn bias_share(&self) -> f64 {
+        let force_norm = norms(&self.physical.forces);
+        if self.scale == 0.0 || force_norm <= 0.0 {
+            return 0.0;
+        }
+        self.scale * norms(&self.pull_back.gradient) / force_norm
+    }
+
+    /// Power of the bias of the last evaluation on atoms with these velocities (Å/fs) and, through its virial, on a cell with
+    /// this strain rate (1/fs), eV/fs.
+    pub fn bias_power(&self, velocities: &[Vec3], strain_rate: Option<&Matrix3>) -> f64 {
+        if self.scale == 0.0 {
+            return 0.0;
+        }
+        let pairs = self.pull_back.gradient.iter().zip(velocities);
+        let of_atoms: f64 = pairs.map(|(gradient, velocity)| cell::dot(*gradient, *velocity)).sum();
+        let of_cell = strain_rate.map_or(0.0, |rate| {
+            let pairs = self.pull_back.virial.iter().flatten().zip(rate.iter().flatten());
+            pairs.map(|(virial, rate)| virial * rate).sum()
+        });
+        self.scale * (of_atoms + of_cell)
     }
 
     /// Features of the atoms that [`BiasedPotential::grades`] graded, [n × D].
@@ -147,9 +185,9 @@ impl BiasedPotential {
     }
 
     fn add_bias(&mut self, out: &mut Evaluation) {
-        let norm = |vectors: &[Vec3]| vectors.iter().map(|v| cell::norm(*v)).sum::<f64>();
-        let (force_norm, gradient_norm) = (norm(&out.forces), norm(&self.pull_back.gradient));
+        let (force_norm, gradient_norm) = (norms(&out.forces), norms(&self.pull_back.gradient));
         let scale = self.tau * self.state.advance(force_norm, gradient_norm, self.bias_averaging_steps);
+        self.scale = scale;
         for (force, gradient) in out.forces.iter_mut().zip(&self.pull_back.gradient) {
             *force = cell::add(*force, cell::scale(*gradient, scale));
         }
@@ -174,6 +212,7 @@ impl Potential for BiasedPotential {
         neighbours: &NeighbourList,
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
+        self.scale = 0.0;
         if self.tau == 0.0 {
             self.potential.evaluate(structure, neighbours, out)?;
             copy(out, &mut self.physical);
@@ -185,6 +224,11 @@ impl Potential for BiasedPotential {
         }
         Ok(())
     }
+}
+
+/// Σ‖v‖
+fn norms(vectors: &[Vec3]) -> f64 {
+    vectors.iter().map(|v| cell::norm(*v)).sum()
 }
 
 /// Copies `from` to `to`, whose memory is reused.

@@ -20,6 +20,8 @@ pub struct WalkSettings {
     pub biased_steps: u64,
     /// Steps over which the two norms of τ_r are exponentially averaged.
     pub bias_averaging_steps: u64,
+    /// Steps between two points of the trace; 0: none.
+    pub trace_interval: u64,
     /// Neighbour-list skin, Å.
     pub skin: f64,
     /// When a structure becomes a candidate.

@@ -6,6 +6,7 @@
 mod candidate;
 mod error;
 mod state;
+mod trace;
 
 use std::sync::Arc;
 
@@ -15,7 +16,7 @@ use md::{Dynamics, Stream};
 use potentials::grace::Threads;
 use potentials::{ModelWithFeatures, Zbl};
 use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd, WalkProgress};
-use wire::{Candidate, Origin};
+use wire::{Candidate, Origin, TracePoint};
 
 use crate::bias::{BiasedPotential, UngradedError};
 use crate::guard;
@@ -59,6 +60,7 @@ pub fn advance(
                 outcome: Outcome::Ended(end),
                 checkpoint,
                 progress: WalkProgress::default(),
+                trace: Vec::new(),
             });
         }
     };
@@ -75,6 +77,7 @@ pub fn advance(
         outcome,
         checkpoint: running.encode(),
         progress: running.progress(),
+        trace: running.take_trace(),
     })
 }
 
@@ -94,6 +97,7 @@ struct RunningWalk<'a> {
     dynamics: Dynamics,
     potential: BiasedPotential,
     state: WalkState,
+    trace: Vec<TracePoint>,
 }
 
 impl<'a> RunningWalk<'a> {
@@ -128,8 +132,12 @@ impl<'a> RunningWalk<'a> {
             dynamics,
             potential,
             state,
+            trace: Vec::new(),
         };
         walk.apply_verdict();
+        if assignment.checkpoint.is_none() {
+            walk.trace_if_due()?;
+        }
         Ok(walk)
     }
 
@@ -166,6 +174,7 @@ impl<'a> RunningWalk<'a> {
                 return Ok(Outcome::Interrupted);
             }
             self.advance_one_step()?;
+            self.trace_step()?;
             if let Some(outcome) = self.inspect_step()? {
                 return Ok(outcome);
             }

@@ -8,4 +8,5 @@ mod mutate;
 mod calculations;
 mod deep_models;
 mod labeller;
+mod trace;
 mod walk;

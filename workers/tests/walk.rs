@@ -23,24 +23,24 @@ fn data(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/data").join(path)
 }
 
-fn seed_structure(name: &str) -> Structure {
+pub fn seed_structure(name: &str) -> Structure {
     let frames = read_extxyz(&data("aluminium_seeds.extxyz")).unwrap();
     frames.into_iter().find(|frame| frame.info["name"].text() == Some(name)).unwrap().structure
 }
 
-fn model() -> Arc<GraceModel> {
+pub fn model() -> Arc<GraceModel> {
     Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap())
 }
 
-fn mixture() -> Arc<Mixture> {
+pub fn mixture() -> Arc<Mixture> {
     Arc::new(Artifact::load(data("al_eam_1l/gmm_artifacts.npz")).unwrap().mixture)
 }
 
-fn uniform_zbl(inner: f64, outer: f64) -> Option<ZblWindows> {
+pub fn uniform_zbl(inner: f64, outer: f64) -> Option<ZblWindows> {
     Some(ZblWindows::Uniform(ZblWindow { inner, outer }))
 }
 
-fn settings() -> WalkSettings {
+pub fn settings() -> WalkSettings {
     WalkSettings {
         rng_seed: 3,
         thermostat: ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 }),
@@ -48,6 +48,7 @@ fn settings() -> WalkSettings {
         equilibration_steps: 20,
         biased_steps: 600,
         bias_averaging_steps: 10,
+        trace_interval: 50,
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'").unwrap(),
         min_interval: 200,
@@ -65,7 +66,7 @@ fn settings() -> WalkSettings {
     }
 }
 
-fn conditions() -> WalkConditions {
+pub fn conditions() -> WalkConditions {
     WalkConditions {
         temperature: 600.0,
         tau: 0.15,
@@ -74,7 +75,7 @@ fn conditions() -> WalkConditions {
     }
 }
 
-fn assignment(structure: Structure, until: u64) -> Assignment {
+pub fn assignment(structure: Structure, until: u64) -> Assignment {
     Assignment {
         campaign: CampaignId([1; 16]),
         walk: WalkId(0),
@@ -91,19 +92,19 @@ fn assignment(structure: Structure, until: u64) -> Assignment {
     }
 }
 
-fn run(settings: &WalkSettings, assignment: &Assignment) -> AssignmentReport<Candidate> {
+pub fn run(settings: &WalkSettings, assignment: &Assignment) -> AssignmentReport<Candidate> {
     let context =
         WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings.clone()) };
     advance(&context, assignment, mixture(), || false, |_| {}).unwrap()
 }
 
 /// The first 150 steps of a walk under these conditions.
-fn first_of(seed: &str, conditions: WalkConditions) -> Assignment {
+pub fn first_of(seed: &str, conditions: WalkConditions) -> Assignment {
     Assignment { conditions, ..assignment(seed_structure(seed), 150) }
 }
 
 /// Runs a walk, one assignment as long as the first after the other, with every candidate accepted, until it ends.
-fn whole_walk(settings: &WalkSettings, first: Assignment) -> Vec<AssignmentReport<Candidate>> {
+pub fn whole_walk(settings: &WalkSettings, first: Assignment) -> Vec<AssignmentReport<Candidate>> {
     let steps_per_assignment = first.last_step;
     let mut next = first;
     let mut reports = Vec::new();
@@ -175,7 +176,7 @@ fn damaged_checkpoints_do_not_stop_a_walker() {
     assert!(refused > 0);
 }
 
-fn never() -> CollectionRule {
+pub fn never() -> CollectionRule {
     toml::from_str("rule = 'maximum_grade'\nthreshold = 1e9").unwrap()
 }
 
@@ -218,7 +219,7 @@ fn the_bias_is_the_hal_force() {
 }
 
 /// Forces of the potential alone and ∇Σγ.
-fn reference(
+pub fn reference(
     model: &Arc<GraceModel>,
     mixture: &Mixture,
     structure: &Structure,

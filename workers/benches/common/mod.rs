@@ -76,6 +76,7 @@ fn settings(threshold: f64) -> WalkSettings {
         equilibration_steps: EQUILIBRATION,
         biased_steps: 10_000_000,
         bias_averaging_steps: 10,
+        trace_interval: 50,
         skin: 0.5,
         collection: toml::from_str(&format!("rule = 'maximum_grade'\nthreshold = {threshold:e}"))
             .expect("a rule"),

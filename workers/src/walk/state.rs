@@ -34,6 +34,8 @@ pub(super) struct WalkState {
     /// Targets of roll backs, oldest first.
     pub good: Vec<(Checkpoint, BiasState)>,
     pub gamma_max: f64,
+    /// Number of points of the trace so far.
+    pub trace_points: u64,
 }
 
 /// A collection, as seen from the current path of the walk: it lies `beyond` steps off the path, which it left at
@@ -106,6 +108,7 @@ pub(super) fn start(
         min_distances,
         good: vec![(dynamics.checkpoint().clone(), BiasState::default())],
         gamma_max: 0.0,
+        trace_points: 0,
     };
     Ok((dynamics, state))
 }
