@@ -131,7 +131,7 @@ class ReadingTests(CampaignCase):
             np.testing.assert_array_equal(found, np.array(rows).reshape(found.shape))
             self.assertLessEqual(trace["step"].max(initial=0), walk.step)
             points += len(rows)
-        self.assertGreater(points, 20)
+        self.assertGreater(points, 8)
         with self.assertRaisesRegex(KeyError, "has no walk 999"):
             self.campaign.walk_trace(999)
         if _has("pandas"):
