@@ -178,7 +178,7 @@ fn a_split_assignment_gives_the_same_points() {
 
 #[test]
 fn an_abandoned_path_keeps_its_points_and_the_work_is_that_of_the_path() {
-    let settings = WalkSettings { zbl: uniform_zbl(1.0, 1.8), trace_interval: 2, ..settings() };
+    let settings = WalkSettings { zbl: uniform_zbl(1.0, 1.8), trace_interval: 4, ..settings() };
     let reports = whole_walk(&settings, first_of("fcc-100", WalkConditions { tau: 2.0, ..conditions() }));
     let trace: Vec<_> = reports.iter().flat_map(|report| &report.trace).collect();
     assert!(trace.iter().zip(0..).all(|(point, number)| point.number == number));
