@@ -188,8 +188,8 @@ fn an_abandoned_path_keeps_its_points_and_the_work_is_that_of_the_path() {
     for pair in back {
         let [left, next] = pair else { panic!("two points") };
         assert!(next.step <= left.step && next.segment == left.segment + 1, "{left:?} {next:?}");
-        let target = trace.iter().filter(|point| point.segment <= left.segment);
-        let target = target.filter(|point| point.step < next.step).next_back().unwrap();
+        let before = |point: &&&TracePoint| point.segment <= left.segment && point.step < next.step;
+        let target = trace.iter().rfind(before).unwrap();
         let others = |point: &TracePoint| (point.bias_work - target.bias_work).abs();
         assert!(others(next) < 0.2 * others(left), "{target:?} {left:?} {next:?}");
     }
