@@ -193,6 +193,7 @@ fn walk_settings() -> WalkSettings {
         barostat: BarostatSettings::default(),
         reference_steps: 0,
         cell_bias: CellBiasSettings::default(),
+        trace_interval: 50,
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nmin_atoms = 3")
             .unwrap(),

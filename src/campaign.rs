@@ -26,7 +26,7 @@ use orchestrator::selector::{CampaignMode, PotentialVersion, SelectorSettings, T
 use potentials::grace::Precision;
 use serde_json::{Value, json};
 use store::Protocol;
-use wire::{CampaignId, ContentHash};
+use wire::{CampaignId, ContentHash, MAX_KEPT_POINTS};
 use workers::settings::{GuardSettings, WalkSettings};
 
 use crate::config::{Config, ConfigError, LabelMethod, Loaded, Warning, without_changeable};
@@ -189,11 +189,14 @@ impl LoadedCampaign {
     }
 
     /// Size of the largest message between walker and selector, bytes: a candidate of the largest seed structure with
-    /// the checkpoints of its walk (three states with velocities and forces).
+    /// the checkpoints of its walk (three states with velocities and forces) and the points of its trace.
     pub fn largest_message(&self) -> usize {
         let atoms = self.seed_structures.iter().map(|named| named.plan.structure.len()).max().unwrap_or(0);
         let features = self.artifact.mixture.dimension();
-        8 * atoms * (9 + features) + 512 * atoms + 16_384
+        let interval = self.config.walk.trace_interval;
+        let points = self.config.run.steps_per_assignment.get().checked_div(interval).unwrap_or(0);
+        let points = points.min(MAX_KEPT_POINTS as u64) as usize + 2;
+        8 * atoms * (9 + features) + 512 * atoms + 192 * points + 16_384
     }
 
     /// The configuration with every default filled in, and with hashes instead of paths. A campaign that continues is
@@ -300,6 +303,7 @@ impl LoadedCampaign {
             barostat: walk.barostat.unwrap_or_default(),
             reference_steps: walk.reference_steps,
             cell_bias: walk.cell_bias.unwrap_or_default().settings(),
+            trace_interval: walk.trace_interval,
             skin: walk.skin.get(),
             collection: collect.criterion,
             min_interval: collect.min_interval,

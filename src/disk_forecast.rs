@@ -1,8 +1,10 @@
 //! Estimates the disk space of a campaign from its limits.
 
 use monitor::disk::DiskForecast;
+use wire::MAX_KEPT_POINTS;
 
 use crate::campaign::LoadedCampaign;
+use crate::config::Config;
 
 /// Decision, candidate, job, attempt and label with their indexes, without what scales with the number of atoms,
 /// bytes.
@@ -13,6 +15,8 @@ const HALF_PAGE_BYTES: u64 = 8_192;
 const EMPTY_DATABASE_BYTES: u64 = 500_000;
 /// A walk's checkpoints, bytes per atom.
 const CHECKPOINT_BYTES_PER_ATOM: u64 = 450;
+/// A point of the trace of a walk, bytes.
+const POINT_BYTES: u64 = 152;
 /// Largest size of SQLite's write-ahead log, bytes.
 pub const WAL_BYTES: u64 = 70_000_000;
 
@@ -28,15 +32,27 @@ pub fn estimate(campaign: &LoadedCampaign) -> DiskForecast {
         config.collect.max_structures.map_or(collected, |total| collected.min(total.get().into()));
     let copies = if config.campaign.control { 2 } else { 1 };
     let mean = seeds().map(|atoms| structure_bytes(atoms, features)).sum::<u64>() / number.max(1);
-    let checkpoint = |(atoms, walks)| walks as u64 * (CHECKPOINT_BYTES_PER_ATOM * atoms + HALF_PAGE_BYTES);
-    let checkpoints = seeds().zip(walks()).map(checkpoint).sum::<u64>();
+    let trace = trace_bytes(config);
+    let walk = |atoms| CHECKPOINT_BYTES_PER_ATOM * atoms + HALF_PAGE_BYTES + trace;
+    let walks = seeds().zip(walks()).map(|(atoms, walks)| walks as u64 * walk(atoms)).sum::<u64>();
     let mixture: usize =
         campaign.artifact.mixture.iter().map(|(.., component)| component.to_bytes().len()).sum();
     DiskForecast {
         structures: copies * collected * mean,
-        rest: EMPTY_DATABASE_BYTES + copies * checkpoints + mixture as u64,
+        rest: EMPTY_DATABASE_BYTES + copies * walks + mixture as u64,
         declined: config.collect.declined_features_mb * 1_000_000,
         max_structures: copies * collected,
+    }
+}
+
+/// The trace of a walk that makes all its steps.
+fn trace_bytes(config: &Config) -> u64 {
+    let steps = config.walk.equilibration_steps.saturating_add(config.walk.biased_steps.get());
+    match steps.checked_div(config.walk.trace_interval) {
+        Some(points) => {
+            POINT_BYTES * points.saturating_add(1).min(MAX_KEPT_POINTS as u64 + 1) + HALF_PAGE_BYTES
+        }
+        None => 0,
     }
 }
 

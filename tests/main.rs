@@ -59,6 +59,7 @@ mod unlabelled_updates;
 mod upfit;
 mod versions;
 mod walk_groups;
+mod walk_traces;
 mod wrong_artifacts;
 mod wrong_campaign;
 mod wrong_input;

@@ -3,7 +3,8 @@
 //! [`Snapshot`] is the state of a campaign; [`candidate_details`] the history of one candidate; [`label_statistics`]
 //! the potential's errors against labels, and biased walks against their controls; [`label_cost`] what labels cost;
 //! [`mixture_status`] how far the mixture has moved; [`versions`] the versions of its potential, and [`improvement`] what
-//! one gained; [`refit_progress`] whether another one follows; [`end_reason`] why the campaign ended. Nothing here writes to the store, and nothing renders: values leave
+//! one gained; [`refit_progress`] whether another one follows; [`end_reason`] why the campaign ended; [`walk_trace`] how
+//! a walk went. Nothing here writes to the store, and nothing renders: values leave
 //! as numbers, or as the JSON that the documents describe.
 
 pub mod calibration;
@@ -28,5 +29,6 @@ pub mod snapshot;
 pub mod version_finds;
 pub mod versions;
 pub mod walk_ends;
+pub mod walk_trace;
 
 pub use snapshot::{DEVICE, Snapshot};

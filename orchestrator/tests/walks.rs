@@ -4,8 +4,8 @@ use orchestrator::selector::{
     CampaignMode, Scheduling, Selector, SelectorSettings, SelectorSnapshot, UpdateProtocol,
 };
 use store::records::{ComponentRecord, Fate};
-use wire::messages::{Outcome, WalkEnd, WalkProgress};
-use wire::{Origin, WalkId};
+use wire::messages::{Assignment, AssignmentReport, Outcome, WalkEnd, WalkProgress};
+use wire::{Origin, TracePoint, WalkId};
 
 use crate::common;
 use crate::common::memory::MemoryStore;
@@ -182,6 +182,27 @@ fn assignments_of_lost_walkers_are_assigned_again() {
             "what has ended is not given out again"
         );
     }
+}
+
+#[test]
+fn the_points_of_every_report_are_committed_with_it() {
+    let point = |number| TracePoint { number, ..TracePoint::default() };
+    let traced = |assignment: &Assignment, outcome, numbers: &[u64]| AssignmentReport {
+        trace: numbers.iter().copied().map(point).collect(),
+        ..common::report(assignment, outcome, at(10))
+    };
+    let numbers = |commit: &store::records::Commit| -> Vec<(u32, Vec<u64>)> {
+        let traces = commit.traces.iter();
+        traces.map(|(walk, points)| (walk.0, points.iter().map(|point| point.number).collect())).collect()
+    };
+    let mut selector = begin(&settings(CampaignMode::Reproducible), 2);
+    let [first, second] = [(); 2].map(|()| next_assignment(&mut selector));
+    let interrupted = decided(&mut selector, traced(&second, Outcome::Interrupted, &[0, 1]));
+    assert_eq!(numbers(&interrupted), [(1, vec![0, 1])]);
+    let second = next_assignment(&mut selector);
+    assert!(selector.report(traced(&second, Outcome::StepsDone, &[2])).unwrap().is_none());
+    let commit = decided(&mut selector, traced(&first, Outcome::StepsDone, &[0]));
+    assert_eq!(numbers(&commit), [(0, vec![0]), (1, vec![2])]);
 }
 
 fn returned(segment: u32, step: u64) -> WalkProgress {

@@ -38,6 +38,7 @@ from .records import (
 )
 from .store import Store, open_store, pages
 from .store_errors import DamagedError, StoreError
+from .traces import Trace, decode_trace, empty_trace
 
 _FILTERS = {field.name for field in fields(CandidateFilter)}
 
@@ -203,6 +204,19 @@ class Campaign:
                 seed_structure_name=names.get(row["seed_structure"], ""),
                 conditions=conditions.get(row["walk"]),
             )
+
+    def walk_trace(self, walk: int) -> Trace:
+        """The trace of a walk: a numpy array for each quantity, from the first point to the last. What a point does not have
+        is NaN (docs/walk-diagnostics.md)."""
+        if not self._store.rows("SELECT walk FROM walk WHERE walk = ?", [walk]):
+            raise KeyError(f"{self.location} has no walk {walk}")
+        if self.schema < 19:
+            return empty_trace()
+        rows = self._store.rows("SELECT * FROM walk_trace WHERE walk = ?", [walk])
+        if not rows:
+            return empty_trace()
+        checksums.WALK_TRACE.verify(rows[0])
+        return decode_trace(walk, rows[0]["points"], bytes(rows[0]["data"]))
 
     def seed_structures(self) -> Iterator[SeedStructure]:
         """The structures where walks start, by index."""

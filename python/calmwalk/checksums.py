@@ -99,6 +99,7 @@ WALK = _table(
     temperature:r relative_volume:r gamma_max:r rejected:i rollbacks:i selector_state:t""",
 )
 WALK_CONDITIONS = _table("walk_conditions", "walk", "walk:i conditions:t")
+WALK_TRACE = _table("walk_trace", "walk", "walk:i points:i data:b")
 VERSION = _table(
     "version",
     "number",

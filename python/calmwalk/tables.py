@@ -13,6 +13,7 @@ import numpy as np
 from .blocks import decode_vectors
 from .records import WalkConditions
 from .store_errors import MissingPackage
+from .traces import QUANTITIES, WHOLE
 
 if TYPE_CHECKING:
     from .campaign import Campaign
@@ -121,6 +122,15 @@ def _walks(campaign: Campaign) -> Iterator[Record]:
         }
 
 
+def _traces(campaign: Campaign, walk: int | None = None) -> Iterator[Record]:
+    walks = [one.walk for one in campaign.walks()] if walk is None else [walk]
+    for number in walks:
+        columns = {name: values.tolist() for name, values in campaign.walk_trace(number).items()}
+        for values in zip(*columns.values(), strict=True):
+            point = {name: None if value != value else value for name, value in zip(columns, values, strict=True)}
+            yield {"walk": number} | point
+
+
 def _mixtures(campaign: Campaign) -> Iterator[Record]:
     for decision in campaign.mixture_updates():
         update = decision.detail.get("update") or {}
@@ -174,8 +184,16 @@ TABLES: dict[str, Table] = {
         ),
         _labels,
     ),
-    "walks": Table(_columns(f"{_WALK} {_OF_WALK} volume_from:float volume_to:float
-            pressure:float start_volume:float cell_bias:bool repeat:int"), _walks),
+    "walks": Table(
+        _columns(
+            f"""{_WALK} {_OF_WALK} volume_from:float volume_to:float pressure:float start_volume:float
+            cell_bias:bool repeat:int"""
+        ),
+        _walks,
+    ),
+    "traces": Table(
+        {"walk": "int"} | {name: "int" if name in WHOLE else "float" for name in QUANTITIES}, _traces
+    ),
     "mixtures": Table(
         _columns(
             """mixture_version:int decision:int kind:text candidate:text walk:int alpha:float components:int

@@ -73,11 +73,12 @@ def make(directory: Path, store: str = "") -> str:
     return location
 
 
-def run(*arguments: str) -> None:
-    """Run the binary; an error has what it printed."""
+def run(*arguments: str) -> str:
+    """Run the binary and return its output; an error has what it printed."""
     done = subprocess.run([str(program()), *arguments], capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"calmwalk {' '.join(arguments)} failed: {done.stdout}{done.stderr}")
+    return done.stdout
 
 
 def _frames(path: Path) -> list[str]:

@@ -120,6 +120,25 @@ class ReadingTests(CampaignCase):
         found = np.min(gammas, axis=0).max()
         self.assertAlmostEqual(found, last.detail["update"]["gamma_max_after"], delta=1e-8)
 
+    def test_traces_are_those_of_the_program_number_by_number(self) -> None:
+        points = 0
+        for walk in self.campaign.walks():
+            text = small_campaign.run("walks", self.location, "trace", str(walk.walk)).splitlines()
+            trace = self.campaign.walk_trace(walk.walk)
+            self.assertEqual(list(trace), text[0].split(","))
+            rows = [[float(cell or "nan") for cell in line.split(",")] for line in text[1:]]
+            found = np.array(list(trace.values())).T
+            np.testing.assert_array_equal(found, np.array(rows).reshape(found.shape))
+            self.assertLessEqual(trace["step"].max(initial=0), walk.step)
+            points += len(rows)
+        self.assertGreater(points, 8)
+        with self.assertRaisesRegex(KeyError, "has no walk 999"):
+            self.campaign.walk_trace(999)
+        if _has("pandas"):
+            frame = self.campaign.pandas("traces")
+            self.assertEqual(len(frame), points)
+            self.assertTrue((self.campaign.pandas("traces", walk=1)["walk"] == 1).all())
+
     def test_filters_select_what_they_say(self) -> None:
         everything = list(self.campaign.candidates())
         some = everything[0]
@@ -343,12 +362,15 @@ class DamageTests(CampaignCase):
     def test_a_damaged_walk_component_or_structure(self) -> None:
         self.change(
             "UPDATE walk SET rollbacks = rollbacks + 1 WHERE walk = 1",
+            "UPDATE walk_trace SET data = flip(data, 40)",
             "UPDATE component SET bytes = flip(bytes, 40)",
             "UPDATE structure SET data = flip(data, 40)",
         )
         with calmwalk.open(self.copy) as damaged:
             with self.assertRaisesRegex(DamagedError, "walk 1: its content"):
                 list(damaged.walks())
+            with self.assertRaisesRegex(DamagedError, "walk trace 1: its content"):
+                damaged.walk_trace(1)
             with self.assertRaisesRegex(DamagedError, "component 0: its content"):
                 list(damaged.components())
             with self.assertRaisesRegex(DamagedError, "structure [0-9]+: its content"):

@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may change when a campaign is resumed; all others keep their first values.
-pub(super) const CHANGEABLE: [&str; 91] = [
+pub(super) const CHANGEABLE: [&str; 92] = [
     "campaign.control_share",
     "potential.python.environment",
     "potential.python.launcher",
@@ -16,6 +16,7 @@ pub(super) const CHANGEABLE: [&str; 91] = [
     "potential.python.compile_timeout",
     "potential.python.cache",
     "seed_structures",
+    "walk.trace_interval",
     "collect.max_per_walk",
     "collect.max_per_seed_structure",
     "collect.max_structures",

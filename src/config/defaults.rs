@@ -51,6 +51,11 @@ pub fn bias_averaging_steps() -> NonZeroU64 {
     nonzero(10).into()
 }
 
+/// Small against the time in which a structure becomes new, and a hundredth of the cost of a control walk at most.
+pub fn trace_interval() -> u64 {
+    50
+}
+
 pub fn skin() -> Positive {
     positive(0.5)
 }

@@ -158,6 +158,9 @@ pub struct WalkSection {
     /// Number of steps over which the norms in τ_r are averaged.
     #[serde(default = "defaults::bias_averaging_steps")]
     pub bias_averaging_steps: NonZeroU64,
+    /// Number of steps between two points of the trace, which shows temperature, pressure, grade and bias along a walk. 0: none.
+    #[serde(default = "defaults::trace_interval")]
+    pub trace_interval: u64,
     /// Skin of the neighbour list, Å.
     #[serde(default = "defaults::skin")]
     pub skin: Positive,

@@ -11,6 +11,7 @@ mod tables;
 #[cfg(test)]
 mod tests;
 mod text;
+mod walk_traces;
 
 use store::Store;
 

@@ -15,6 +15,7 @@ use store::{
 };
 
 use super::collections::Collections;
+use super::walk_traces::{self, GroupTraces};
 
 /// Largest number of labels in the cost figure: the newest.
 const MAX_COSTS: u32 = 100_000;
@@ -39,6 +40,8 @@ pub struct ReportData {
     pub fates_by_seed_structure: Vec<FateCount>,
     /// The collected structures.
     pub collections: Collections,
+    /// Traces of the biased walks, by group.
+    pub walk_traces: Vec<GroupTraces>,
     /// Versions of the potential.
     pub versions: CampaignVersions,
     /// `None` without a label protocol.
@@ -92,10 +95,12 @@ impl ReportData {
             Some(protocol) => Some(ProtocolLabels::read(store, protocol, version).await?),
             None => None,
         };
+        let walk_traces = walk_traces::read(store, &status, version).await?;
         let first = store.operations(0, 1).await?;
         Ok(Self {
             status,
             versions,
+            walk_traces,
             configuration: serde_json::from_str(&campaign.configuration_in_force).unwrap_or_default(),
             values: values.collect(),
             fates: store.fates_by_decision(part).await?,
@@ -106,6 +111,13 @@ impl ReportData {
             collections,
             labels,
         })
+    }
+}
+
+impl ReportData {
+    /// The threshold of the collection rule.
+    pub fn collection_threshold(&self) -> Option<f64> {
+        monitor::walk_trace::threshold(&self.campaign.configuration_in_force)
     }
 }
 

@@ -7,7 +7,10 @@ use store::{
     Store, VersionRecord, VersionState, WalkRecord,
 };
 use wire::messages::{DeclineReason, WalkProgress};
-use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
+use wire::{
+    CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, TracePoint, WalkConditions,
+    WalkId,
+};
 
 use super::*;
 use crate::wording::comparison;
@@ -326,6 +329,44 @@ fn walk(number: u32, version: u32, origin: Origin) -> WalkRecord {
         progress: WalkProgress::default(),
         selector_state: "{}".into(),
         checkpoint: None,
+    }
+}
+
+/// Walks of 200 steps with a point after every 50, at a temperature of 300 K plus their number.
+async fn traced(store: &Store, number: u32) {
+    let progress = WalkProgress { step: 200, ..WalkProgress::default() };
+    let record = |number| WalkRecord { progress: progress.clone(), ..walk(number, 0, Origin::Biased) };
+    let point = |walk: u32, number: u64| TracePoint {
+        number,
+        step: 50 * number,
+        time: 100.0 * number as f64,
+        temperature: 300.0 + f64::from(walk),
+        gamma_max: Some(1.0),
+        ..TracePoint::default()
+    };
+    let traces = (0..number).map(|walk| (WalkId(walk), (0..5).map(|number| point(walk, number)).collect()));
+    let (walks, traces) = ((0..number).map(record).collect(), traces.collect());
+    store.commit(&Commit { walks, traces, ..Commit::default() }).await.unwrap();
+}
+
+#[tokio::test]
+async fn walks_have_a_line_each_until_they_are_many() {
+    let rule = json!({ "collect": { "criterion": { "rule": "maximum_grade", "threshold": 1.5 } } });
+    for (number, titles, row, rows) in [
+        (3, "walk,segment,step,temperature,", "\n2,0,50,302,", 15),
+        (9, "quantity,step,walks,smallest,median,largest\n", "\ntemperature,1.005,9,300,304,308\n", 35),
+    ] {
+        let directory = tempfile::tempdir().unwrap();
+        let store = begin(directory.path(), &rule.to_string()).await;
+        traced(&store, number).await;
+        let files = build(&store, None).await.unwrap();
+        let csv = file(&files, "figures/walks.csv");
+        assert!(csv.starts_with(titles) && csv.contains(row), "{csv}");
+        assert_eq!(csv.lines().count(), 1 + rows, "{csv}");
+        let (page, drawn) = (words(file(&files, PAGE)), words(file(&files, "figures/walks.svg")));
+        assert!(page.contains(&format!("(n = {number})")) && page.contains("the threshold 1.5"), "{page}");
+        assert!(drawn.contains("step of 2 fs") && !drawn.contains("pressure"), "{drawn}");
+        assert_eq!(drawn.contains("walk 2"), number == 3, "{drawn}");
     }
 }
 

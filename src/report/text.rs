@@ -1,5 +1,6 @@
 //! The page: what it says, and in which order.
 
+use super::figures::walks;
 use super::report_data::ReportData;
 use super::tables::collection_rule;
 use crate::page::style::grouped;
@@ -27,6 +28,7 @@ fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [PageTa
             "Collected structures",
             blocks(vec![why, numbered("collection"), table("conditions"), table("seed-structures")]),
         ),
+        ("Walks", (0..data.walk_traces.len()).filter_map(|number| numbered(&walks::name(number))).collect()),
         (
             "Biased against control walks",
             blocks(vec![

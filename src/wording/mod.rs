@@ -17,3 +17,4 @@ pub mod reference_check;
 pub mod unlabelled;
 pub mod versions;
 pub mod walk_ends;
+pub mod walk_trace;

@@ -111,6 +111,10 @@ pub static WALK: CheckedTable = checked!("walk" by walk Integer {
 pub static WALK_CONDITIONS: CheckedTable =
     checked!("walk_conditions" by walk Integer { walk: Integer, conditions: Text });
 
+/// Traces of walks.
+pub static WALK_TRACE: CheckedTable =
+    checked!("walk_trace" by walk Integer { walk: Integer, points: Integer, data: Bytes });
+
 /// Versions of the potential, which have never been without checksums. Their hashes cover their files.
 pub static VERSION: CheckedTable = checked!("version" by number Integer {
     number: Integer, parent: Integer, state: Text, reason: Text, method: Text, structures: Integer,

@@ -42,6 +42,7 @@ mod store;
 mod tables;
 mod versions;
 mod walk_progress;
+mod walk_trace;
 
 use std::time::{SystemTime, UNIX_EPOCH};
 

@@ -6,7 +6,9 @@ use atoms::cell::norm;
 use atoms::{Matrix3, Structure, Vec3};
 use serde::{Deserialize, Serialize};
 use wire::messages::{DeclineReason, WalkProgress};
-use wire::{CampaignId, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
+use wire::{
+    CampaignId, CandidateBlock, CandidateId, ContentHash, Origin, TracePoint, WalkConditions, WalkId,
+};
 
 /// Name of the value with the grades of the training frames under the newest mixture (JSON of
 /// `calm::forgetting::GradeDistribution`, with `alarm`).
@@ -239,6 +241,8 @@ pub struct Commit {
     pub walks: Vec<WalkRecord>,
     /// Small named values of the selector (round, mixture version, used byte budget, [`TRAINING_FRAMES`] …).
     pub values: Vec<(String, String)>,
+    /// New points of walks' traces, in order; a walk may have several entries.
+    pub traces: Vec<(WalkId, Vec<TracePoint>)>,
 }
 
 /// A label: the result of a reference calculation for a structure.

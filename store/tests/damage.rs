@@ -14,11 +14,12 @@ use wire::messages::DeclineReason;
 
 use crate::common::*;
 use crate::version_records::{version_files, version_record};
+use crate::walk_trace::trace_point;
 
 /// Columns whose bits are flipped: numbers of labels, structures, features, grades, decisions, the mixture, walks,
-/// archives, seed structures, imports and versions of the potential. Keys are left out: foreign keys and other rows
+/// archives, seed structures, imports, versions of the potential and traces of walks. Keys are left out: foreign keys and other rows
 /// check them.
-const COLUMNS: [(&str, &[&str]); 14] = [
+const COLUMNS: [(&str, &[&str]); 15] = [
     ("structure", &["hash", "atoms", "data", "checksum"]),
     ("seed_structure", &["structure", "checksum"]),
     ("protocol", &["hash", "checksum"]),
@@ -94,6 +95,7 @@ const COLUMNS: [(&str, &[&str]); 14] = [
         ],
     ),
     ("version_file", &["data"]),
+    ("walk_trace", &["points", "data", "checksum"]),
 ];
 
 fn wanted(variable: &str, by_default: u64) -> u64 {
@@ -129,7 +131,8 @@ async fn full(directory: &Path, accepted: u64) -> Store {
         walks[1].accepted = 0;
         let components = vec![ComponentRecord { element: 0, slot: 1, bytes: step.to_le_bytes().repeat(20) }];
         let values = vec![("round".to_owned(), step.to_string())];
-        store.commit(&Commit { walks, components, values, ..commit_of(records) }).await.unwrap();
+        let traces = vec![(walks[0].walk, vec![trace_point(step - 1)])];
+        store.commit(&Commit { walks, components, values, traces, ..commit_of(records) }).await.unwrap();
     }
     for number in 0..accepted * 3 / 4 {
         let lease = store.lease(protocol("dft").hash, "l", 0, 600).await.unwrap().unwrap();
@@ -372,7 +375,7 @@ async fn a_database_of_an_earlier_version_gets_checksums() {
 /// Turns it into a database of version 8 by undoing what later versions add and rename.
 async fn without_checksums(directory: &Path) {
     let mut connection = connect(directory).await;
-    let mut sql = "DROP INDEX job_order; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
+    let mut sql = "DROP TABLE walk_trace; DROP INDEX job_order; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
         CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
         DROP TABLE version_file; DROP TABLE version;
         DROP TABLE walk_conditions; DROP TRIGGER label_has_checksum; DROP INDEX label_excluded;

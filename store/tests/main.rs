@@ -21,4 +21,5 @@ mod queue_model;
 mod relabel;
 mod version_records;
 mod versions;
+mod walk_trace;
 mod without_label;

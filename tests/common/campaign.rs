@@ -5,6 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use store::{ComponentRecord, ExportFilter, Location, Store, VersionRecord};
+use wire::TracePoint;
 
 use super::config;
 
@@ -133,6 +134,7 @@ pub struct Outcome {
     pub decisions: String,
     pub components: Vec<ComponentRecord>,
     pub walks: Vec<(u32, String, u64, Option<Vec<u8>>)>,
+    pub traces: Vec<Vec<TracePoint>>,
     pub dataset: Vec<u8>,
     /// Versions of the potential: everything but time and cost.
     pub versions: Vec<VersionRecord>,
@@ -187,14 +189,22 @@ pub fn outcome_at(location: &str, directory: &Path) -> Outcome {
     runtime.block_on(async {
         let store = Store::open_read_only(location).await.expect("the campaign's database");
         check_consistency(&store).await;
-        let walks = store.load_walks().await.expect("walks").into_iter();
+        let walks = store.load_walks().await.expect("walks");
+        let mut traces = Vec::new();
+        for walk in &walks {
+            traces.push(store.walk_trace(walk.walk).await.expect("a trace"));
+        }
         let versions = store.versions().await.expect("versions").into_iter();
         let without_time = |version| VersionRecord { seconds: 0.0, core_hours: 0.0, time: 0, ..version };
         Outcome {
             versions: versions.map(without_time).collect(),
             decisions: store.decision_log_text().await.expect("decisions"),
             components: store.load_components().await.expect("components"),
-            walks: walks.map(|walk| (walk.walk.0, walk.state, walk.assignments, walk.checkpoint)).collect(),
+            traces,
+            walks: walks
+                .into_iter()
+                .map(|walk| (walk.walk.0, walk.state, walk.assignments, walk.checkpoint))
+                .collect(),
             dataset: fs::read(&output).expect("the exported data set"),
         }
     })

@@ -116,6 +116,7 @@ fn nothing_is_cut_off_and_errors_are_shown_by_grade() {
             browser.run("document.querySelector('#table-seed-structures').scrollIntoView()");
             picture(&browser, &format!("report-{colours}-{width}.png"));
         }
+        walk_page(&browser, &page);
         narrow(&browser, &page, &id);
         picture(&browser, &format!("narrow-{colours}.png"));
         browser.show(&format!("{page}#candidate/{control}"));
@@ -139,6 +140,26 @@ fn same_time(browser: &Browser) {
     assert!(axes.len() > 1 && axes.windows(2).all(|pair| pair[0] == pair[1]), "{axes:?}");
 }
 
+/// The trace of a walk, over steps and over ps.
+fn walk_page(browser: &Browser, page: &str) {
+    browser.show(&format!("{page}#overview"));
+    browser.wait("document.querySelector('a[href=\"#walk/0\"]')");
+    browser.run("document.querySelector('a[href=\"#walk/0\"]').click()");
+    browser.wait("document.querySelectorAll('figure svg[role=img]').length === 8");
+    let text = "return document.querySelector('main').textContent";
+    let shown = browser.run(text);
+    for words in ["Temperature", "P (GPa)", "V/V₀", "threshold", "τ_r (eV)", "W (eV)", "lengths (Å)"] {
+        assert!(shown.as_str().unwrap().contains(words), "{words}: {shown}");
+    }
+    browser.run("document.querySelector('main input[type=checkbox]').click()");
+    browser.wait("document.querySelector('figure').textContent.includes('time (ps)')");
+    let shown = browser.run(text);
+    assert!(
+        !shown.as_str().unwrap().contains("NaN") && !shown.as_str().unwrap().contains("undefined"),
+        "{shown}"
+    );
+}
+
 /// Every page on a narrow screen.
 fn narrow(browser: &Browser, page: &str, id: &str) {
     browser.resize(400);
@@ -148,6 +169,7 @@ fn narrow(browser: &Browser, page: &str, id: &str) {
         ("errors", "document.querySelectorAll('figure svg[role=img]').length === 3"),
         ("hosts", "document.querySelector('main p, main table')"),
         (&format!("candidate/{id}"), "document.querySelectorAll('.atoms tbody tr').length > 20"),
+        ("walk/0", "document.querySelectorAll('figure svg[role=img]').length === 8"),
         ("overview", "document.querySelectorAll('.tile').length === 5"),
     ] {
         fits(browser, &format!("{page}#{name}"), is_there);

@@ -7,6 +7,8 @@
 //! The bias does not enter the virial: the cell has a bias of its own, along the direction of ∂𝒰/∂ε, which is averaged
 //! here ([`crate::cell_bias`]).
 
+mod work;
+
 use std::sync::Arc;
 
 use atoms::{Evaluation, Matrix3, NeighbourList, Potential, PotentialError, Species, Structure, Vec3, cell};
@@ -14,6 +16,8 @@ use calm::{BatchedGrades, GradeError, Grades, Mixture};
 use potentials::grace::PullBack;
 use potentials::{PotentialWithFeatures, Zbl};
 use serde::{Deserialize, Serialize};
+
+pub use work::BiasWork;
 
 /// State of the bias, part of a walk's checkpoint.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -26,6 +30,8 @@ pub struct BiasState {
     pub gradient_norm: f64,
     /// Running average of the unit direction of ∂𝒰/∂ε.
     pub strain_direction: Matrix3,
+    /// Work of the bias on the atoms so far.
+    pub work: BiasWork,
 }
 
 impl BiasState {
@@ -73,6 +79,8 @@ pub struct BiasedPotential {
     /// State of the running averages.
     pub state: BiasState,
     bias_averaging_steps: u64,
+    /// τ_r at the last evaluation, eV.
+    scale: f64,
     pull_back: PullBack,
     /// With the bias on.
     parts: BatchedGrades,
@@ -102,6 +110,7 @@ impl BiasedPotential {
             tau: 0.0,
             state: BiasState::default(),
             bias_averaging_steps,
+            scale: 0.0,
             pull_back: PullBack::default(),
             parts: BatchedGrades::default(),
             grades: Grades::default(),
@@ -125,6 +134,29 @@ impl BiasedPotential {
             return Matrix3::default();
         }
         unit(&self.state.strain_direction).map(|row| row.map(|x| -stress * x))
+    }
+
+    /// τ_r at the last evaluation, eV.
+    pub fn bias_scale(&self) -> f64 {
+        self.scale
+    }
+
+    /// Σ‖τ_r ∇𝒰‖ / Σ‖F^phys‖ at the last evaluation; 0 without bias, and without forces.
+    pub fn bias_share(&self) -> f64 {
+        let force_norm = norms(&self.physical.forces);
+        if self.scale == 0.0 || force_norm <= 0.0 {
+            return 0.0;
+        }
+        self.scale * norms(&self.pull_back.gradient) / force_norm
+    }
+
+    /// Power of the bias of the last evaluation on atoms with these velocities (Å/fs), eV/fs.
+    pub fn bias_power(&self, velocities: &[Vec3]) -> f64 {
+        if self.scale == 0.0 {
+            return 0.0;
+        }
+        let pairs = self.pull_back.gradient.iter().zip(velocities);
+        self.scale * pairs.map(|(gradient, velocity)| cell::dot(*gradient, *velocity)).sum::<f64>()
     }
 
     /// Features of the atoms that [`BiasedPotential::grades`] graded, [n × D].
@@ -175,10 +207,10 @@ impl BiasedPotential {
     }
 
     fn add_bias(&mut self, out: &mut Evaluation) {
-        let norm = |vectors: &[Vec3]| vectors.iter().map(|v| cell::norm(*v)).sum::<f64>();
-        let (force_norm, gradient_norm) = (norm(&out.forces), norm(&self.pull_back.gradient));
+        let (force_norm, gradient_norm) = (norms(&out.forces), norms(&self.pull_back.gradient));
         let (strain, steps) = (&self.pull_back.virial, self.bias_averaging_steps);
         let scale = self.tau * self.state.advance(force_norm, gradient_norm, strain, steps);
+        self.scale = scale;
         for (force, gradient) in out.forces.iter_mut().zip(&self.pull_back.gradient) {
             *force = cell::add(*force, cell::scale(*gradient, scale));
         }
@@ -200,6 +232,7 @@ impl Potential for BiasedPotential {
         neighbours: &NeighbourList,
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
+        self.scale = 0.0;
         if self.tau == 0.0 {
             self.potential.evaluate(structure, neighbours, out)?;
             copy(out, &mut self.physical);
@@ -211,6 +244,11 @@ impl Potential for BiasedPotential {
         }
         Ok(())
     }
+}
+
+/// Σ‖v‖
+fn norms(vectors: &[Vec3]) -> f64 {
+    vectors.iter().map(|v| cell::norm(*v)).sum()
 }
 
 /// Copies `from` to `to`, whose memory is reused.

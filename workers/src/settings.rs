@@ -29,6 +29,8 @@ pub struct WalkSettings {
     pub reference_steps: u64,
     /// Bias on the cell of walks at constant pressure that have one.
     pub cell_bias: CellBiasSettings,
+    /// Steps between two points of the trace; 0: none.
+    pub trace_interval: u64,
     /// Neighbour-list skin, Å.
     pub skin: f64,
     /// When a structure becomes a candidate.

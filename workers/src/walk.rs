@@ -7,6 +7,7 @@ mod candidate;
 mod constant_pressure;
 mod error;
 mod state;
+mod trace;
 
 use std::sync::Arc;
 
@@ -16,7 +17,7 @@ use md::{Dynamics, Stream};
 use potentials::grace::Threads;
 use potentials::{ModelWithFeatures, Zbl};
 use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd, WalkProgress};
-use wire::{Candidate, Origin};
+use wire::{Candidate, Origin, TracePoint};
 
 use crate::bias::{BiasedPotential, UngradedError};
 use crate::cell_bias::CellBias;
@@ -61,6 +62,7 @@ pub fn advance(
                 outcome: Outcome::Ended(end),
                 checkpoint,
                 progress: WalkProgress::default(),
+                trace: Vec::new(),
             });
         }
     };
@@ -77,6 +79,7 @@ pub fn advance(
         outcome,
         checkpoint: running.encode(),
         progress: running.progress(),
+        trace: running.take_trace(),
     })
 }
 
@@ -96,6 +99,7 @@ struct RunningWalk<'a> {
     dynamics: Dynamics,
     potential: BiasedPotential,
     state: WalkState,
+    trace: Vec<TracePoint>,
 }
 
 impl<'a> RunningWalk<'a> {
@@ -130,8 +134,12 @@ impl<'a> RunningWalk<'a> {
             dynamics,
             potential,
             state,
+            trace: Vec::new(),
         };
         walk.apply_verdict();
+        if assignment.checkpoint.is_none() {
+            walk.trace_if_due()?;
+        }
         Ok(walk)
     }
 
@@ -174,6 +182,7 @@ impl<'a> RunningWalk<'a> {
                 return Ok(Outcome::Interrupted);
             }
             self.advance_one_step()?;
+            self.trace_step()?;
             if let Some(outcome) = self.inspect_step()? {
                 return Ok(outcome);
             }

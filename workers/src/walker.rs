@@ -95,5 +95,6 @@ fn crash_report(work: &WorkItem) -> AssignmentReport<Candidate> {
         outcome: Outcome::Ended(end),
         checkpoint: work.assignment.checkpoint.clone().unwrap_or_default(),
         progress: WalkProgress::default(),
+        trace: Vec::new(),
     }
 }

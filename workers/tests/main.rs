@@ -9,4 +9,5 @@ mod calculations;
 mod constant_pressure;
 mod deep_models;
 mod labeller;
+mod trace;
 mod walk;

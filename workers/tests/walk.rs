@@ -37,7 +37,7 @@ pub fn mixture() -> Arc<Mixture> {
     Arc::new(Artifact::load(data("al_eam_1l/gmm_artifacts.npz")).unwrap().mixture)
 }
 
-fn uniform_zbl(inner: f64, outer: f64) -> Option<ZblWindows> {
+pub fn uniform_zbl(inner: f64, outer: f64) -> Option<ZblWindows> {
     Some(ZblWindows::Uniform(ZblWindow { inner, outer }))
 }
 
@@ -52,6 +52,7 @@ pub fn settings() -> WalkSettings {
         barostat: BarostatSettings::default(),
         reference_steps: 0,
         cell_bias: CellBiasSettings::default(),
+        trace_interval: 50,
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'").unwrap(),
         min_interval: 200,
@@ -69,7 +70,7 @@ pub fn settings() -> WalkSettings {
     }
 }
 
-fn conditions() -> WalkConditions {
+pub fn conditions() -> WalkConditions {
     WalkConditions {
         temperature: 600.0,
         tau: 0.15,
@@ -102,7 +103,7 @@ pub fn run(settings: &WalkSettings, assignment: &Assignment) -> AssignmentReport
 }
 
 /// The first 150 steps of a walk under these conditions.
-fn first_of(seed: &str, conditions: WalkConditions) -> Assignment {
+pub fn first_of(seed: &str, conditions: WalkConditions) -> Assignment {
     Assignment { conditions, ..assignment(seed_structure(seed), 150) }
 }
 
@@ -222,7 +223,7 @@ fn the_bias_is_the_hal_force() {
 }
 
 /// Forces of the potential alone and ∇Σγ.
-fn reference(
+pub fn reference(
     model: &Arc<GraceModel>,
     mixture: &Mixture,
     structure: &Structure,

@@ -36,6 +36,13 @@ impl Cell {
         [scale(cross(b, c), 1.0 / volume), scale(cross(c, a), 1.0 / volume), scale(cross(a, b), 1.0 / volume)]
     }
 
+    /// Lengths a, b, c of the lattice vectors, Å, and the angles α = ∠(b, c), β = ∠(a, c) and γ = ∠(a, b) between them, °.
+    pub fn lengths_and_angles(&self) -> [f64; 6] {
+        let [a, b, c] = self.0;
+        let angle = |u, v| (dot(u, v) / (norm(u) * norm(v))).clamp(-1.0, 1.0).acos().to_degrees();
+        [norm(a), norm(b), norm(c), angle(b, c), angle(a, c), angle(a, b)]
+    }
+
     /// Distance between opposite faces of the cell in each lattice direction, Å.
     pub fn heights(&self) -> Vec3 {
         self.reciprocal().map(|b| 1.0 / norm(b))
@@ -141,6 +148,12 @@ mod tests {
         let position = [1.5, -7.0, 22.0];
         let back = cell.cartesian(cell.fractional(position));
         assert!(norm(sub(back, position)) < 1e-12);
+        let [lengths, angles] = [[5.0, 2.0, 3.0], [90.0, 60.0, 90.0]];
+        let (c, s) = (3.0 * 0.5, 3.0 * 0.75_f64.sqrt());
+        let oblique = Cell([[5.0, 0.0, 0.0], [0.0, 2.0, 0.0], [c, 0.0, s]]).lengths_and_angles();
+        for (found, expected) in oblique.iter().zip(lengths.iter().chain(&angles)) {
+            assert!((found - expected).abs() < 1e-12, "{oblique:?}");
+        }
         assert!((cell.heights()[2] - cell.volume() / norm(cross(cell.0[0], cell.0[1]))).abs() < 1e-12);
     }
 }

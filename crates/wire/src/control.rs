@@ -18,9 +18,10 @@ use serde::{Deserialize, Serialize};
 use crate::block::CandidateBlock;
 use crate::ids::{CandidateId, Origin, WalkId};
 use crate::messages::{Assignment, AssignmentReport, Outcome, WalkEnd, WalkProgress};
+use crate::walk_trace::TracePoint;
 
 const MAGIC: [u8; 4] = *b"CALM";
-const VERSION: u8 = 3;
+const VERSION: u8 = 4;
 const PREFIX: usize = MAGIC.len() + 1 + 4;
 
 /// Why bytes are not a valid control message.
@@ -103,6 +104,7 @@ pub(crate) struct EncodedReport<'a> {
     #[serde(serialize_with = "crate::bytes::serialize")]
     checkpoint: &'a [u8],
     progress: Cow<'a, WalkProgress>,
+    trace: Cow<'a, [TracePoint]>,
 }
 
 /// An [`Outcome`] with the candidate replaced by its id.
@@ -124,7 +126,8 @@ impl<'a> EncodedReport<'a> {
             Outcome::Ended(end) => EncodedOutcome::Ended(Cow::Borrowed(end)),
         };
         let (checkpoint, progress) = (report.checkpoint.as_slice(), Cow::Borrowed(&report.progress));
-        Self { walk: report.walk, assignment: report.assignment, outcome, checkpoint, progress }
+        let trace = Cow::Borrowed(report.trace.as_slice());
+        Self { walk: report.walk, assignment: report.assignment, outcome, checkpoint, progress, trace }
     }
 
     /// The report with its candidate, which arrived separately.
@@ -132,7 +135,7 @@ impl<'a> EncodedReport<'a> {
         self,
         candidate: Option<CandidateBlock>,
     ) -> Result<AssignmentReport, ControlError> {
-        let Self { walk, assignment, outcome, checkpoint, progress } = self;
+        let Self { walk, assignment, outcome, checkpoint, progress, trace } = self;
         let outcome = checked_outcome(walk, outcome, candidate)?;
         Ok(AssignmentReport {
             walk,
@@ -140,6 +143,7 @@ impl<'a> EncodedReport<'a> {
             outcome,
             checkpoint: checkpoint.to_vec(),
             progress: progress.into_owned(),
+            trace: trace.into_owned(),
         })
     }
 }

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::block::CandidateBlock;
 use crate::conditions::WalkConditions;
 use crate::ids::{CampaignId, Origin, WalkId};
+use crate::walk_trace::TracePoint;
 
 /// A piece of one walk, for any idle walker.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -174,6 +175,8 @@ pub struct AssignmentReport<C = CandidateBlock> {
     pub checkpoint: Vec<u8>,
     /// Current state of the walk.
     pub progress: WalkProgress,
+    /// The points of the walk's trace since the last report, thinned ([`crate::thin`]).
+    pub trace: Vec<TracePoint>,
 }
 
 impl<C> AssignmentReport<C> {
@@ -185,8 +188,8 @@ impl<C> AssignmentReport<C> {
             Outcome::Interrupted => Outcome::Interrupted,
             Outcome::Ended(end) => Outcome::Ended(end),
         };
-        let Self { walk, assignment, checkpoint, progress, .. } = self;
-        AssignmentReport { walk, assignment, outcome, checkpoint, progress }
+        let Self { walk, assignment, checkpoint, progress, trace, .. } = self;
+        AssignmentReport { walk, assignment, outcome, checkpoint, progress, trace }
     }
 }
 

@@ -9,6 +9,9 @@ use atoms::{
 use serde::Serialize;
 use serde_json::Value;
 use store::{CandidateRef, Store, StoreError, StoredCandidate, WalkStatus};
+use wire::TracePoint;
+
+use crate::walk_trace::point_before;
 
 /// Cutoff of the neighbour search, Å. No larger distance matters to the guards.
 const NEIGHBOUR_CUTOFF: f64 = 8.0;
@@ -40,6 +43,8 @@ pub struct Discovery {
     pub partner: Option<CandidateRef>,
     /// Distances that the guards check.
     pub distances: GuardDistances,
+    /// The last point of the walk's trace before it, in its segment.
+    pub trace_point: Option<TracePoint>,
     /// Current state of the walk, with the rejections by its guard.
     pub walk_now: Option<WalkStatus>,
 }
@@ -83,6 +88,7 @@ impl Discovery {
             Some(partner) => store.accepted_at(partner, id.step).await?,
             None => None,
         };
+        let trace = store.walk_trace(id.walk).await?;
         let of_seed = seed.as_ref().and_then(|seed| shortest_distances(&seed.structure));
         Ok(Self {
             walk: id.walk.0,
@@ -96,6 +102,7 @@ impl Discovery {
             energy: view.energy(),
             control_of: control_of.map(|walk| walk.0),
             partner,
+            trace_point: point_before(&trace, id.segment, id.step).cloned(),
             distances: GuardDistances::new(&view.structure(), of_seed, rules),
             walk_now,
         })

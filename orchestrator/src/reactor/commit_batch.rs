@@ -7,13 +7,14 @@ use store::records::Commit;
 
 /// Appends `later` to `commit`.
 pub fn append(commit: &mut Commit, later: Commit) {
-    let Commit { decisions, candidates, components, restart_mixture, walks, values } = later;
+    let Commit { decisions, candidates, components, restart_mixture, walks, values, traces } = later;
     commit.decisions.extend(decisions);
     commit.candidates.extend(candidates);
     if restart_mixture {
         commit.components.clear();
         commit.restart_mixture = true;
     }
+    commit.traces.extend(traces);
     // Of records that are overwritten, only the newest is kept.
     replace(&mut commit.components, components, |component| (component.element, component.slot));
     replace(&mut commit.walks, walks, |walk| walk.walk);

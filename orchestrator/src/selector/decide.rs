@@ -41,6 +41,7 @@ impl DecisionState {
             let id = report.walk;
             touched.insert(id);
             let (steps, accepted) = (self.apply_report(&report, &mut commit), self.accepted);
+            commit.traces.push((id, report.trace));
             match report.outcome {
                 Outcome::Candidate(regraded) => {
                     let decided = regraded.and_then(|regraded| self.take(id, regraded, &mut commit));

@@ -201,7 +201,8 @@ impl Selector {
         let WalkRecord { assignments: number, checkpoint, progress, .. } = walk.record.clone();
         let (checkpoint, outcome) =
             (checkpoint.unwrap_or_default(), Outcome::Ended(WalkEnd::Diverged { reason }));
-        self.report(AssignmentReport { walk: id, assignment: number, outcome, checkpoint, progress })
+        let trace = Vec::new();
+        self.report(AssignmentReport { walk: id, assignment: number, outcome, checkpoint, progress, trace })
     }
 
     /// Regrades reports for [`Selector::report_regraded`], for example on other threads.
@@ -225,8 +226,8 @@ impl Selector {
         self.assigned.remove(&id);
         if matches!(report.outcome, Outcome::Interrupted) {
             let walk = self.decisions.walk_mut(id);
-            walk.interrupt(report);
-            let commit = Commit { walks: vec![walk.to_record()], ..Commit::default() };
+            let traces = vec![(id, walk.interrupt(report))];
+            let commit = Commit { walks: vec![walk.to_record()], traces, ..Commit::default() };
             self.update_ready([id]);
             return Ok(Some(commit));
         }

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use store::records::WalkRecord;
 use wire::messages::{AssignmentReport, Verdict, WalkEnd, WalkProgress};
-use wire::{Origin, WalkConditions, WalkId};
+use wire::{Origin, TracePoint, WalkConditions, WalkId};
 
 use super::error::SelectorError;
 
@@ -106,11 +106,12 @@ impl Walk {
     }
 
     /// Records where an assignment was interrupted; it continues from there. The checkpoint already accounts for the
-    /// verdict with which it started.
-    pub fn interrupt<C>(&mut self, report: AssignmentReport<C>) {
+    /// verdict with which it started. Returns the points of its trace.
+    pub fn interrupt<C>(&mut self, report: AssignmentReport<C>) -> Vec<TracePoint> {
         self.record.checkpoint = Some(report.checkpoint);
         self.record.progress = report.progress;
         self.state.verdict = None;
+        report.trace
     }
 
     /// Whether it ended only because of a limit.

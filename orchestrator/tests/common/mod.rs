@@ -212,7 +212,14 @@ pub fn at(step: u64) -> WalkProgress {
 
 pub fn report(assignment: &Assignment, outcome: Outcome, progress: WalkProgress) -> AssignmentReport {
     let checkpoint = format!("step {}", progress.step).into_bytes();
-    AssignmentReport { walk: assignment.walk, assignment: assignment.number, outcome, checkpoint, progress }
+    AssignmentReport {
+        walk: assignment.walk,
+        assignment: assignment.number,
+        outcome,
+        checkpoint,
+        progress,
+        trace: Vec::new(),
+    }
 }
 
 /// A report with a candidate at a step: the structure with this number and these features.

@@ -154,6 +154,9 @@ fn write_found(out: &mut dyn Write, found: &Discovery) -> io::Result<()> {
             &format!("a control walk: unbiased, with the random numbers of walk {biased}, {partner}"),
         )?;
     }
+    if let Some(point) = &found.trace_point {
+        line(out, "", &wording::walk_trace::sentence(point))?;
+    }
     let Some(walk) = &found.walk_now else { return Ok(()) };
     let reason = if walk.reason.is_empty() { String::new() } else { format!(" ({})", walk.reason) };
     // Control walks offer frames at requested steps, on which only the selector's guard decides, and never roll back.
@@ -220,6 +223,7 @@ mod tests {
                 control_of: None,
                 partner: None,
                 distances: GuardDistances { shortest: None, atoms: None, pairs: Vec::new() },
+                trace_point: None,
                 walk_now: None,
             };
             let mut out = Vec::new();

@@ -11,6 +11,7 @@ mod pairs;
 mod projection;
 mod space;
 mod versions;
+pub(super) mod walks;
 
 use ::figures::{Axis, AxisScale, Panel};
 use analysis::Histogram;
@@ -37,6 +38,7 @@ pub fn all(data: &ReportData) -> Vec<FigureEntry> {
         part("cost", "Cost of labels", cost::draw(data)),
         part("completion", "Labelled share of structures", completion::draw(data)),
     ];
+    all.splice(1..1, walks::all(data));
     if !data.versions.all.is_empty() {
         all.push(part("errors-by-labels", "Force errors by number of labels", versions::by_labels(data)));
         all.push(part("errors-by-cost", "Force errors by cost", versions::by_core_hours(data)));

@@ -16,7 +16,9 @@ use axum::extract::{Path, State};
 use axum::middleware;
 use axum::routing::{get, post};
 use monitor::mixture_status::InitialMixture;
+use monitor::walk_trace::WalkTrace;
 use store::Store;
+use wire::WalkId;
 
 pub use self::actions::Mutations;
 use self::cache::CachedResponse;
@@ -24,8 +26,8 @@ use self::response::{ApiResult, json};
 use self::sse::StatusFeed;
 use super::security;
 
-/// Largest number of candidates in the trace of a walk.
-const MAX_TRACE_POINTS: u32 = 2000;
+/// Largest number of candidates of a walk that are shown.
+const MAX_CANDIDATES_OF_WALK: u32 = 2000;
 
 /// State of the request handlers. Clones share it.
 #[derive(Clone, Debug)]
@@ -64,7 +66,8 @@ impl Dashboard {
             .route("/api/actions", get(actions::action_status))
             .route("/api/errors", get(force_errors::force_errors))
             .route("/api/mixture", get(mixture::mixture))
-            .route("/api/walks/{walk}/candidates", get(trace))
+            .route("/api/walks/{walk}/candidates", get(candidates_of_walk))
+            .route("/api/walks/{walk}/trace", get(trace_of_walk))
             .route("/api/walks/{walk}/{action}", post(actions::act_on_walks))
             .fallback(response::not_found)
             .layer(middleware::map_response(security::add_security_headers))
@@ -72,6 +75,10 @@ impl Dashboard {
     }
 }
 
-async fn trace(State(dashboard): State<Dashboard>, Path(walk): Path<u32>) -> ApiResult {
-    json(&dashboard.store.list_walk(walk, MAX_TRACE_POINTS).await?)
+async fn candidates_of_walk(State(dashboard): State<Dashboard>, Path(walk): Path<u32>) -> ApiResult {
+    json(&dashboard.store.list_walk(walk, MAX_CANDIDATES_OF_WALK).await?)
+}
+
+async fn trace_of_walk(State(dashboard): State<Dashboard>, Path(walk): Path<u32>) -> ApiResult {
+    json(&WalkTrace::read(&dashboard.store, WalkId(walk)).await?)
 }

@@ -37,6 +37,7 @@ const FILES: &[(&str, &str)] = files![
     "structure.js",
     "style.css",
     "versions.js",
+    "walk.js",
 ];
 
 /// `GET /`

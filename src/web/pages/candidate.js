@@ -47,7 +47,7 @@ function about({ structure, found, file, frame, same_structure: same, same_impor
   return facts([
     ["formula", `${formula}, ${whole(atoms)} atoms`],
     ["volume", volume && `${digits(volume, "Å³")} (${digits(volume / atoms, "Å³")} per atom)${found ? `, V/V₀ ${decimals(found.relative_volume, 4)}` : ""}`],
-    ["found", found && element("span", {}, `walk ${found.walk} of seed structure ${found.seed_structure_name}, segment ${found.segment}, step ${whole(found.step)}, `,
+    ["found", found && element("span", {}, element("a", { href: `#walk/${found.walk}` }, `walk ${found.walk}`), ` of seed structure ${found.seed_structure_name}, segment ${found.segment}, step ${whole(found.step)}, `,
       `at ${decimals(found.temperature, 0, "K")}`)],
     ["version of the potential", found?.version > 0 && whole(found.version)],
     ["energy of the potential", found && `${decimals(found.energy / atoms, 4, "eV")} per atom`],

@@ -8,23 +8,26 @@ import * as errors from "./errors.js";
 import * as hosts from "./hosts.js";
 import * as mixture from "./mixture.js";
 import * as overview from "./overview.js";
+import * as walk from "./walk.js";
 import { campaignState } from "./campaign_state.js";
 
 /** Pages in the order of the menu, by the first word of their address. */
 const PAGES = { overview, candidates, mixture, errors, hosts };
+/** Pages of one thing, and the page of the menu that they belong to. */
+const DETAILS = { candidate: { page: candidate, below: candidates }, walk: { page: walk, below: overview } };
 const CONNECTIONS = { live: "● live", finished: "✓ finished", stopped: "○ stopped: no run is active", lost: "○ no connection: retrying", unreachable: "○ the database does not answer" };
 
 let shown = new AbortController();
 
 function show() {
   const [name, ...rest] = location.hash.slice(1).split("/").filter(Boolean);
-  const page = name === "candidate" ? candidate : PAGES[name] ?? overview;
+  const page = DETAILS[name]?.page ?? PAGES[name] ?? overview;
   shown.abort();
   shown = new AbortController();
   const content = document.getElementById("content");
   content.replaceChildren(element("h1", {}, page.TITLE));
   document.title = `${page.TITLE} – calmwalk`;
-  const current = page === candidate ? candidates : page;
+  const current = DETAILS[name]?.below ?? page;
   for (const link of document.querySelectorAll("#pages a")) {
     link.toggleAttribute("data-current", PAGES[link.dataset.page] === current);
     if (PAGES[link.dataset.page] === current) link.setAttribute("aria-current", "page");

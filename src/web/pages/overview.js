@@ -163,7 +163,7 @@ function walks({ walks: all, run_active }, changed) {
   };
   const button = (walk) => (isUnderWay(walk) || walk.paused) && pauseButton(walk.walk, walk.paused, change([walk], !walk.paused));
   const rows = order.slice(0, WALKS).map((walk) => [
-    whole(walk.walk), walk.seed_structure, walk.origin, sentence(state(walk.paused ? "paused" : !run_active && walk.state === "running" ? "stopped" : walk.state), walk.reason && ` ${walk.reason}`),
+    element("a", { href: `#walk/${walk.walk}`, "data-keep": `walk-${walk.walk}` }, whole(walk.walk)), walk.seed_structure, walk.origin, sentence(state(walk.paused ? "paused" : !run_active && walk.state === "running" ? "stopped" : walk.state), walk.reason && ` ${walk.reason}`),
     whole(walk.step), decimals(walk.temperature, 0, "K"), decimals(walk.relative_volume, 4), decimals(walk.gamma_max, 2),
     digits(walk.tau), digits(walk.steps_per_second), whole(walk.accepted), whole(walk.rejected), ...(changed ? [button(walk) || ""] : [])]);
   const more = all.length - rows.length;

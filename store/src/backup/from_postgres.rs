@@ -44,7 +44,7 @@ macro_rules! table {
 
 /// All tables except those of the leader, of processes and their progress, and of job counts, which triggers count
 /// again. Each table comes after those that it references. A new database already has some rows of `campaign`.
-const TABLES: [CopiedTable; 19] = [
+const TABLES: [CopiedTable; 20] = [
     table!("campaign" { key: T, value: T, checksum: I }),
     table!("value" { name: T, value: T, checksum: I }),
     table!("structure" { number: I, hash: B, atoms: I, formula: T, data: B, checksum: I }),
@@ -70,6 +70,7 @@ const TABLES: [CopiedTable; 19] = [
         selector_state: T, checkpoint: B, checksum: I, checkpoint_checksum: I,
     }),
     table!("walk_conditions" { walk: I, conditions: T, checksum: I }),
+    table!("walk_trace" { walk: I, points: I, data: B, checksum: I }),
     table!("job" {
         number: I, structure: I, protocol: I, decision: I, state: T, priority: I, holder: T, expires: I, attempts: I,
         failures: I, overruled: I, relabel: T, relabel_after: I, value: R, value_factors: T,

@@ -3,6 +3,7 @@
 use crate::checksum::{
     ARCHIVE, CAMPAIGN, CANDIDATE, CHECKPOINT, COMPONENT, CheckedColumn, CheckedTable, DECISION, IMPORT,
     LABEL, LONG_COLUMNS, Names, PROTOCOL, SEED_STRUCTURE, STRUCTURE, VALUE, WALK, WALK_CONDITIONS,
+    WALK_TRACE,
 };
 use crate::database::{SqlRow, SqlValue, Transaction, execute_rows, query};
 use crate::error::Result;
@@ -77,6 +78,7 @@ static WALKS: Paged = Paged {
     ..paged!(WALK, "walk", "walk")
 };
 static CONDITIONS: Paged = paged!(WALK_CONDITIONS, "walk_conditions", "walk");
+static TRACES: Paged = paged!(WALK_TRACE, "walk_trace", "walk");
 static CANDIDATES: Paged = Paged {
     columns: &["decision", "checksum", "features_checksum", "selector_checksum", "original_checksum"],
     page: "SELECT candidate.*, features, selector_grades, original_grades
@@ -184,12 +186,15 @@ async fn next(
     Ok(Some((row, key)))
 }
 
-/// Verifies rows that no other check reads: campaign values, seed structures, walks, imports, the selector's values
+/// Verifies rows that no other check reads: campaign values, seed structures, walks and their
+/// traces, imports, the selector's values
 /// and the mixture. Returns the faults.
 pub(crate) async fn verify_others(transaction: &mut Transaction) -> Result<Vec<String>> {
     let mut faults = Vec::new();
-    if transaction.has_table(CONDITIONS.table.name).await? {
-        CONDITIONS.verify(transaction, &[], &mut faults).await?;
+    for paged in [&CONDITIONS, &TRACES] {
+        if transaction.has_table(paged.table.name).await? {
+            paged.verify(transaction, &[], &mut faults).await?;
+        }
     }
     for paged in [&SEED_STRUCTURES, &IMPORTS] {
         paged.verify(transaction, &[], &mut faults).await?;

@@ -37,4 +37,5 @@ pub mod structures;
 pub mod versions;
 mod walk_conditions;
 mod walk_progress;
+mod walk_trace;
 pub mod without_label;

@@ -9,13 +9,13 @@ use super::{candidate, commit_of, name_of, protocol, walk};
 
 /// Turns the tables into those of version 17, without the number of the version.
 pub const TO_VERSION_17: &str = "DROP INDEX job_order;
-    ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
+    DROP TABLE walk_trace; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
     CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
     DELETE FROM _sqlx_migrations WHERE version > 17";
 
 /// Turns the tables into those of version 16, without the number of the version.
 pub const TO_VERSION_16: &str = "DROP INDEX job_order;
-    ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
+    DROP TABLE walk_trace; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
     CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
     DROP TABLE version_file; DROP TABLE version;
     DELETE FROM _sqlx_migrations WHERE version > 16";
@@ -24,7 +24,7 @@ pub const TO_VERSION_16: &str = "DROP INDEX job_order;
 /// of the candidate is unknown, since no program of this version writes its word.
 pub const TO_VERSION_15: &str = "
     DROP INDEX job_order;
-    ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
+    DROP TABLE walk_trace; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
     CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
     DROP TABLE version_file; DROP TABLE version;
     UPDATE candidate SET reason = 'guard', checksum = -1 WHERE reason = 'too_close';

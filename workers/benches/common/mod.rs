@@ -80,6 +80,7 @@ fn settings(threshold: f64) -> WalkSettings {
         barostat: BarostatSettings::default(),
         reference_steps: 0,
         cell_bias: CellBiasSettings::default(),
+        trace_interval: 50,
         skin: 0.5,
         collection: toml::from_str(&format!("rule = 'maximum_grade'\nthreshold = {threshold:e}"))
             .expect("a rule"),

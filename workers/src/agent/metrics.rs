@@ -173,6 +173,7 @@ mod tests {
                 outcome,
                 checkpoint,
                 progress: at(0, 1),
+                trace: Vec::new(),
             })
         };
         let ended = || report(Outcome::Ended(WalkEnd::Completed));

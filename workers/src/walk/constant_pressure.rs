@@ -123,7 +123,7 @@ impl RunningWalk<'_> {
         self.state.reference_run = None;
         self.state.reference_volume = volume;
         self.state.good = vec![self.state.good_state(&self.dynamics, &self.potential)];
-        Ok(())
+        self.trace_if_due()
     }
 
     /// Lets a barostat move the cell from the first step after equilibration on.

@@ -42,6 +42,8 @@ pub(super) struct WalkState {
     /// Targets of roll backs, oldest first.
     pub good: Vec<GoodState>,
     pub gamma_max: f64,
+    /// Number of points of the trace so far.
+    pub trace_points: u64,
 }
 
 /// A state to which a walk can roll back.
@@ -124,6 +126,7 @@ pub(super) fn start(
         min_distances,
         good: Vec::new(),
         gamma_max: 0.0,
+        trace_points: 0,
     };
     state.keep_checkpoint(&dynamics, potential);
     Ok((dynamics, state))

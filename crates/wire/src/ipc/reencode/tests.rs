@@ -37,7 +37,7 @@ fn content(message: &[u8]) -> &[u8] {
 
 /// Arbitrary content as a control message.
 fn encoded(content: &[u8]) -> Vec<u8> {
-    let control = [b"CALM\x03".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat();
+    let control = [b"CALM\x04".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat();
     frame::to_words(&control, None).as_bytes().to_vec()
 }
 
@@ -156,7 +156,7 @@ proptest! {
     fn reports_with_candidates_of_other_walks_are_rejected(sender in sender(), candidate in candidate()) {
         let walk = WalkId(candidate.id.walk.0 ^ 1);
         let (outcome, checkpoint) = (Outcome::Candidate(candidate), Vec::new());
-        let report = AssignmentReport { walk, assignment: 0, outcome, checkpoint, progress: WalkProgress::default() };
+        let report = AssignmentReport { walk, assignment: 0, outcome, checkpoint, progress: WalkProgress::default(), trace: vec![] };
         prop_assert!(is_about_the_candidate(&super::request(&offered(sender, 1, Some(&report)))));
     }
 
@@ -206,7 +206,7 @@ fn errors_are_specific() {
         }
     };
     assert_eq!(changed(8), ControlError::Magic(*b"BALM"));
-    assert_eq!(changed(12), ControlError::Version(2));
+    assert_eq!(changed(12), ControlError::Version(5));
     assert!(matches!(changed(13), ControlError::Checksum { .. }));
     assert!(matches!(changed(CONTENT), ControlError::Checksum { .. }));
     let short = |control: &[u8]| super::answer(frame::to_words(control, None).as_bytes());
@@ -236,7 +236,8 @@ fn excessive_lengths_are_rejected() {
     let sender = SenderId { session: 0, walker: 0, incarnation: 0 };
     let outcome = Outcome::Ended(WalkEnd::Diverged { reason: "a reason".to_owned() });
     let (checkpoint, progress) = (b"checkpoint".to_vec(), WalkProgress::default());
-    let report = AssignmentReport { walk: WalkId(0), assignment: 0, outcome, checkpoint, progress };
+    let report =
+        AssignmentReport { walk: WalkId(0), assignment: 0, outcome, checkpoint, progress, trace: vec![] };
     let offer = offered(sender, 1, Some(&report));
     assert!(super::request(&offer).is_ok());
     assert!(is_refused_with_excessive_length(super::request, &offer, b"a reason"));

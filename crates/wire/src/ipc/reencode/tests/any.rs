@@ -13,6 +13,7 @@ use crate::conditions::{ConstantPressure, WalkConditions};
 use crate::ids::{CampaignId, Origin, WalkId};
 use crate::messages::{Assignment, AssignmentReport, DeclineReason, Outcome, Verdict, WalkEnd, WalkProgress};
 use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
+use crate::walk_trace::TracePoint;
 
 fn verdict() -> impl Strategy<Value = Verdict> {
     prop_oneof![
@@ -121,15 +122,42 @@ pub fn report() -> impl Strategy<Value = AssignmentReport<Candidate>> {
         Just(Outcome::Interrupted),
         end().prop_map(Outcome::Ended),
     ];
-    (any::<u32>(), any::<u64>(), outcome, vec(any::<u8>(), 0..300), progress()).prop_map(
-        |(walk, assignment, outcome, checkpoint, progress)| {
+    (any::<u32>(), any::<u64>(), outcome, vec(any::<u8>(), 0..300), progress(), vec(trace_point(), 0..5))
+        .prop_map(|(walk, assignment, outcome, checkpoint, progress, trace)| {
             let walk = match &outcome {
                 Outcome::Candidate(candidate) => candidate.id.walk,
                 _ => WalkId(walk),
             };
-            AssignmentReport { walk, assignment, outcome, checkpoint, progress }
-        },
-    )
+            AssignmentReport { walk, assignment, outcome, checkpoint, progress, trace }
+        })
+}
+
+fn trace_point() -> impl Strategy<Value = TracePoint> {
+    let place = (any::<u64>(), any::<u32>(), any::<u64>());
+    let (missing, number) = (|| option::of(-1e3..1e9), || -1e3..1e9);
+    let state = (number(), number(), missing(), number(), option::of([(); 6].map(|()| 0.0..180.0)));
+    let bias = (missing(), missing(), number(), number(), number(), number());
+    (place, state, bias).prop_map(|(place, state, bias)| {
+        let (number, segment, step) = place;
+        let (time, temperature, pressure, relative_volume, cell) = state;
+        let (conserved_energy, gamma_max, bias_scale, cell_gain, bias_share, bias_work) = bias;
+        TracePoint {
+            number,
+            segment,
+            step,
+            time,
+            temperature,
+            pressure,
+            relative_volume,
+            cell,
+            conserved_energy,
+            gamma_max,
+            bias_scale,
+            cell_gain,
+            bias_share,
+            bias_work,
+        }
+    })
 }
 
 pub fn sender() -> impl Strategy<Value = SenderId> {

@@ -1,12 +1,15 @@
 //! `calmwalk walks`
 
+mod trace;
+
 use store::{Location, Store, unix_milliseconds};
 use wire::WalkId;
 
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::print;
+pub use trace::TraceArgs;
 
-/// Pause or resume walks
+/// Show or pause walks
 ///
 /// A walk pauses at the end of its current assignment (run.steps_per_assignment), and resumes from there. It stays paused when the
 /// campaign is stopped and resumed. In reproducible mode, the other walks of the same round wait for it, because decisions must
@@ -17,7 +20,15 @@ pub struct WalksArgs {
     #[command(flatten)]
     location: CampaignArgs,
     #[command(subcommand)]
-    action: WalksCommand,
+    action: WalksAction,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum WalksAction {
+    #[command(flatten)]
+    Change(WalksCommand),
+    /// Write the trace of a walk as CSV (docs/walk-diagnostics.md)
+    Trace(TraceArgs),
 }
 
 #[derive(Clone, Debug, PartialEq, clap::Subcommand)]
@@ -41,8 +52,13 @@ pub struct WalkSelectionArgs {
 impl WalksArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         let location = self.location.get()?;
-        let messages = block_on(change(&location, &self.action))??;
-        print(|out| messages.iter().try_for_each(|line| writeln!(out, "{line}")))?;
+        match self.action {
+            WalksAction::Change(change) => {
+                let messages = block_on(self::change(&location, &change))??;
+                print(|out| messages.iter().try_for_each(|line| writeln!(out, "{line}")))?;
+            }
+            WalksAction::Trace(trace) => block_on(trace.run(&location))??,
+        }
         Ok(ExitStatus::Done)
     }
 }

@@ -1,0 +1,74 @@
+//! The points of a walk's trace ([`wire::TracePoint`]), and the work of its bias.
+
+use atoms::Structure;
+use atoms::units::GPA_PER_EV_A3;
+use calm::grade::maximum;
+use wire::{MAX_KEPT_POINTS, TracePoint, thin};
+
+use super::{RunningWalk, WalkError, gamma};
+use crate::cell_bias::CellBias;
+
+impl RunningWalk<'_> {
+    /// Counts the work of the bias in the step that was just made, and adds a point if one is due.
+    pub(super) fn trace_step(&mut self) -> Result<(), WalkError> {
+        let power = self.potential.bias_power(&self.dynamics.state().velocities);
+        let time_step = self.dynamics.checkpoint().time_step;
+        self.potential.state.work.advance(power, time_step);
+        self.trace_if_due()
+    }
+
+    /// Adds a point if one is due at this step. The first is the start of the walk.
+    pub(super) fn trace_if_due(&mut self) -> Result<(), WalkError> {
+        let interval = self.settings.trace_interval;
+        let in_reference_run = self.state.reference_run.is_some();
+        if interval == 0 || in_reference_run || !self.step().is_multiple_of(interval) {
+            return Ok(());
+        }
+        let point = self.trace_point()?;
+        self.state.trace_points += 1;
+        self.trace.push(point);
+        // Long assignments have many points.
+        if self.trace.len() > 2 * MAX_KEPT_POINTS {
+            thin(&mut self.trace);
+        }
+        Ok(())
+    }
+
+    /// The points since the start of the assignment, for its report.
+    pub(super) fn take_trace(&mut self) -> Vec<TracePoint> {
+        thin(&mut self.trace);
+        std::mem::take(&mut self.trace)
+    }
+
+    fn trace_point(&mut self) -> Result<TracePoint, WalkError> {
+        let gamma_max = match gamma(&mut self.potential, &self.dynamics).map_err(WalkError::from) {
+            Ok(gamma) => Some(maximum(gamma)),
+            Err(WalkError::Unavailable(reason)) => return Err(WalkError::Unavailable(reason)),
+            // The walk goes on, or ends where its grades are needed.
+            Err(_) => None,
+        };
+        let pressure = self.dynamics.pressure_tensor();
+        Ok(TracePoint {
+            number: self.state.trace_points,
+            segment: self.state.segment,
+            step: self.step(),
+            time: self.step() as f64 * self.dynamics.checkpoint().time_step,
+            temperature: self.dynamics.temperature(),
+            pressure: pressure.map(|p| GPA_PER_EV_A3 * (p[0][0] + p[1][1] + p[2][2]) / 3.0),
+            relative_volume: self.relative_volume(),
+            cell: cell(self.dynamics.structure()),
+            conserved_energy: self.dynamics.conserved_energy(),
+            gamma_max,
+            bias_scale: self.potential.bias_scale(),
+            cell_gain: self.state.cell_bias.as_ref().map_or(0.0, CellBias::gain),
+            bias_share: self.potential.bias_share(),
+            bias_work: self.potential.state.work.total,
+        })
+    }
+}
+
+/// Lengths (Å) and angles (°) of the lattice vectors, if there is a periodic direction and they span space.
+fn cell(structure: &Structure) -> Option<[f64; 6]> {
+    let periodic = structure.periodic.contains(&true) && structure.cell.volume() > 0.0;
+    periodic.then(|| structure.cell.lengths_and_angles())
+}
