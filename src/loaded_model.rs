@@ -7,6 +7,7 @@ use bridge::{AdapterFeatures, Device, PythonModel};
 use calm::Projection;
 use potentials::ModelWithFeatures;
 use potentials::grace::{GraceModel, Precision, RadialPath};
+use tokio_util::sync::CancellationToken;
 
 use crate::config::Config;
 use crate::exit_status::CommandError;
@@ -58,7 +59,8 @@ impl LoadedModel {
         let model = potential.model.get_ref();
         let Some(python) = &potential.python else { return Self::load_export(model, potential.precision) };
         let wrong = |error: String| CommandError::Input(format!("{}: {error}", path.display()));
-        let device = python_model::start(python.settings(model, potential.precision));
+        let settings = python.settings(model, potential.precision);
+        let device = python_model::start(settings, &CancellationToken::new());
         let device = device.map_err(|error| wrong(error.to_string()))?;
         Ok(Self::Python(Arc::new(PythonModel::local(device).map_err(wrong)?)))
     }

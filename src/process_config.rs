@@ -6,7 +6,8 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge::{ModelDescription, PythonModel};
+use atoms::Structure;
+use bridge::{ModelDescription, ModelReference, PythonModel, PythonSettings};
 use calm::Projection;
 use potentials::ModelWithFeatures;
 use potentials::grace::{GraceModel, Precision, RadialPath};
@@ -35,6 +36,36 @@ pub struct ModelFiles {
     pub artifact: Option<HashedFile>,
     /// Precision of the model's evaluation.
     pub precision: Precision,
+}
+
+/// The model of a campaign for agents, with paths of the orchestrator's host.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields, rename_all = "snake_case")]
+pub enum AgentModel {
+    /// An export of GRACE.
+    Grace(ModelFiles),
+    /// A model that a program of the agent evaluates.
+    Python(Box<AgentPythonModel>),
+}
+
+/// What an agent needs for a program of its own.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct AgentPythonModel {
+    /// How the program is started.
+    pub settings: PythonSettings,
+    /// What the agent's program must say of its model.
+    pub reference: ModelReference,
+    /// Whether its results must have the same bits.
+    pub is_reproducible: bool,
+    /// The model's file, if it is one file.
+    pub model: Option<HashedFile>,
+    /// The adapter's file, if it is one of the user.
+    pub adapter: Option<HashedFile>,
+    /// The artifact with the projection of its invariants, if they are projected.
+    pub artifact: Option<HashedFile>,
+    /// The largest seed structure, for the first batches.
+    pub largest: Structure,
 }
 
 /// The model of a walker.
@@ -91,8 +122,8 @@ pub struct WalkerConfig {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct AgentConfig {
-    /// The model, with paths of the orchestrator's host.
-    pub model: ModelFiles,
+    /// The model.
+    pub model: AgentModel,
     /// Dynamics, bias and guards.
     pub settings: WalkSettings,
     /// Largest message of a walker, bytes.
@@ -190,6 +221,18 @@ impl ModelFiles {
     /// All files.
     pub fn files(&self) -> impl Iterator<Item = &HashedFile> {
         std::iter::once(&self.export).chain(&self.artifact)
+    }
+}
+
+impl AgentModel {
+    /// All files that an agent downloads if they are not on its host.
+    pub fn files(&self) -> Vec<&HashedFile> {
+        match self {
+            Self::Grace(files) => files.files().collect(),
+            Self::Python(python) => {
+                [&python.model, &python.adapter, &python.artifact].into_iter().flatten().collect()
+            }
+        }
     }
 }
 

@@ -13,6 +13,7 @@ use potentials::grace::{GraceModel, RadialPath, Threads};
 use potentials::{ModelWithFeatures, PotentialWithFeatures};
 use serde_json::Value;
 use store::Protocol;
+use tokio_util::sync::CancellationToken;
 use toml::Spanned;
 
 use super::loader::Loader;
@@ -58,7 +59,8 @@ impl Loader<'_> {
                 let key = "potential.python".to_owned();
                 let at = location(self.path, self.text, &key);
                 let failed = |message| ConfigError::File { at, key, message };
-                let device = python_model::start(settings).map_err(|error| error.to_string());
+                let device = python_model::start(settings, &CancellationToken::new());
+                let device = device.map_err(|error| error.to_string());
                 let model = device.and_then(PythonModel::local).map_err(failed)?;
                 self.check_python(&model)?;
                 LoadedModel::Python(Arc::new(model))
@@ -89,20 +91,17 @@ impl Loader<'_> {
                 expected,
             });
         }
-        let Some(test) = model.device().map(|device| &device.info().self_test) else { return Ok(()) };
-        let alone = self.config.potential.python.as_ref().is_some_and(|python| python.max_batch.get() == 1);
-        let expected = if !test.is_deterministic {
-            "\"live\": the model gives other bits when a call is repeated"
-        } else if !test.is_batch_independent && !alone {
-            "\"live\", or potential.python.max_batch = 1: the bits of a structure depend on those beside it in a batch"
-        } else {
+        let (Some(device), Some(python)) = (model.device(), &self.config.potential.python) else {
             return Ok(());
         };
+        let test = &device.info().self_test;
+        let Some(reason) = python_model::irreproducible(test, python.max_batch.get()) else { return Ok(()) };
         if self.config.campaign.mode == CampaignMode::Live {
             return Ok(());
         }
         let key = "campaign.mode".to_owned();
-        let (found, expected) = ("\"reproducible\"".to_owned(), expected.to_owned());
+        let or = if test.is_deterministic { ", or potential.python.max_batch = 1" } else { "" };
+        let (found, expected) = ("\"reproducible\"".to_owned(), format!("\"live\"{or}: {reason}"));
         Err(ConfigError::Value { at: location(self.path, self.text, &key), key, found, expected })
     }
 

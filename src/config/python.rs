@@ -72,7 +72,7 @@ impl PythonSection {
         if let Some(cache) = &mut self.cache {
             *cache = directory.join(&*cache);
         }
-        if let Some((file, class)) = self.adapter.rsplit_once(':').filter(|(file, _)| file.ends_with(".py")) {
+        if let Some((file, class)) = PythonSettings::adapter_file(&self.adapter) {
             self.adapter = format!("{}:{class}", directory.join(file).display());
         }
     }

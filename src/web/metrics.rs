@@ -44,7 +44,7 @@ pub fn text(snapshot: &Snapshot) -> String {
     candidates(&mut text, status);
     walks(&mut text, status);
     if let Some(found) = &snapshot.device {
-        device(&mut text, found);
+        device_metrics(&mut text, found);
     }
     label_queue(&mut text, status);
     let failures: Vec<_> =
@@ -104,7 +104,7 @@ fn candidates(text: &mut MetricsText, status: &CampaignStatus) {
 }
 
 /// The device of a model in Python.
-fn device(text: &mut MetricsText, device: &DeviceStatistics) {
+pub(super) fn device_metrics(text: &mut MetricsText, device: &DeviceStatistics) {
     let mut counter = |name, help, value| text.counter(name, help, &[(&[], value)]);
     counter("calmwalk_device_batches_total", "Batches that the device evaluated.", device.batches as f64);
     counter("calmwalk_device_structures_total", "Structures in them.", device.structures as f64);

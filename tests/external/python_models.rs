@@ -16,7 +16,7 @@ const FAULTS: u32 = 20;
 const CALLS_BETWEEN: usize = 60;
 
 /// A campaign on the radial model of the Python tests, with these lines in `[potential.python]`.
-fn write_campaign(directory: &Path, python: &str) {
+pub fn write_campaign(directory: &Path, python: &str) {
     let data = |file: &str| Path::new(env!("CARGO_MANIFEST_DIR")).join(file).display().to_string();
     let (model, seeds, eam) = (
         data("python/tests/data/radial-al.json"),
@@ -38,12 +38,12 @@ fn write_campaign(directory: &Path, python: &str) {
     fs::write(directory.join("campaign.toml"), text).unwrap();
 }
 
-fn adapter(name: &str, more: &str) -> String {
+pub fn adapter(name: &str, more: &str) -> String {
     let python = std::env::var("CALMWALK_PYTHON").expect("CALMWALK_PYTHON names a Python with numpy");
     format!("environment = {python:?}\nadapter = {name:?}\n{more}")
 }
 
-fn build(directory: &Path) {
+pub fn build(directory: &Path) {
     let frames = config("data/al_eam_1l/seed_frames.extxyz").display().to_string();
     let build = [
         "calm",

@@ -59,7 +59,7 @@ fn overhead(python: &Path) {
     let prepared = place.prepare(1 << 26).expect("shared memory");
     let service = DeviceService::open(&device, &place, 1, 2, 1 << 17).expect("a service");
     let shared = PythonModel::shared(
-        device.info().description.clone(),
+        device.info().description().clone(),
         service.address().clone(),
         CancellationToken::new(),
     );

@@ -35,7 +35,7 @@ impl PythonModel {
     /// # Errors
     /// What is wrong with the description.
     pub fn local(device: Arc<Device>) -> Result<Self, String> {
-        let description = device.info().description.clone();
+        let description = device.info().description().clone();
         Self::new(description, Connection::Local(device))
     }
 

@@ -7,13 +7,12 @@ use tracing::warn;
 use crate::error::CallError;
 use crate::faults::Fault;
 use crate::running::{REFERENCE, Running, Suspect, Work};
+use crate::same_model::have_same_energies;
 use crate::schedule::{DeviceBatch, Kind, Ticket};
 use crate::server::Server;
 
 /// A server that fails so many times without an answer in between is given up.
 const MAX_FAILURES: u32 = 3;
-/// Largest relative difference of the reference structure's energies from those at the start.
-const REFERENCE_TOLERANCE: f64 = 1e-5;
 
 impl Running<'_> {
     /// Asks for a result once more, alone; if that has been tried, asks the reference structure.
@@ -34,10 +33,7 @@ impl Running<'_> {
     /// Compares the reference structure with what it was at the start. If it is the same, suspicious results are those of the model.
     pub fn judge(&mut self, energies: &[f64]) {
         let expected = &self.reference.1;
-        let size = expected.iter().map(|x| x.abs()).fold(1.0, f64::max);
-        let same = energies.len() == expected.len()
-            && energies.iter().zip(expected).all(|(a, b)| (a - b).abs() <= REFERENCE_TOLERANCE * size);
-        if !same {
+        if !have_same_energies(energies, expected) {
             let names = self.setup.settings.names();
             let sum = |energies: &[f64]| energies.iter().sum::<f64>();
             let message = format!(

@@ -10,6 +10,7 @@ use crate::description::{AdapterFeatures, ModelDescription};
 use crate::error::DeviceError;
 use crate::faults::Fault;
 use crate::running::{REFERENCE, Running};
+use crate::same_model::ModelReference;
 use crate::schedule::Schedule;
 use crate::self_test::{self, SelfTestReport, TestSubject};
 use crate::server::{Server, Synchronous};
@@ -18,10 +19,17 @@ use crate::setup::DeviceSetup;
 /// What a device tells of itself when it is ready.
 #[derive(Clone, Debug)]
 pub struct DeviceInfo {
-    /// The model.
-    pub description: ModelDescription,
+    /// The model, and what it gives for the test structure.
+    pub reference: ModelReference,
     /// The figures of the self-test.
     pub self_test: SelfTestReport,
+}
+
+impl DeviceInfo {
+    /// The model.
+    pub fn description(&self) -> &ModelDescription {
+        &self.reference.description
+    }
 }
 
 /// Starts the server, tells whether that went well, and works until the device is closed.
@@ -80,7 +88,7 @@ fn begin<'a>(
         server: Some(server),
         generation: 0,
         identity: description.identity.clone(),
-        reference: (reference, energies),
+        reference: (reference, energies.clone()),
         schedule: Schedule::new(limit as usize),
         clients: HashMap::new(),
         calls: HashMap::new(),
@@ -93,7 +101,7 @@ fn begin<'a>(
         started: Instant::now(),
         given_up: None,
     };
-    Ok((running, DeviceInfo { description, self_test: report }))
+    Ok((running, DeviceInfo { reference: ModelReference { description, energies }, self_test: report }))
 }
 
 fn start_error(fault: Fault) -> DeviceError {
