@@ -41,7 +41,8 @@ pub struct PythonSection {
     /// The same for the start, and for the first calls of each size, for which frameworks compile.
     #[serde(default = "defaults::compile_timeout")]
     pub compile_timeout: Duration,
-    /// Directory in which frameworks keep compiled programs for the next start. Default: none.
+    /// Directory in which frameworks keep compiled programs for the next start, and calmwalk the size of batches that the memory of the
+    /// device takes. Default: none.
     #[serde(default)]
     pub cache: Option<PathBuf>,
 }

@@ -6,6 +6,7 @@
 
 mod arena;
 mod batch;
+mod batch_limit;
 mod call;
 mod client;
 mod description;

@@ -69,12 +69,8 @@ impl Running<'_> {
                     bonds,
                     "the device is short of memory: smaller batches"
                 );
-                self.schedule.limit_bonds(bonds / 2);
-                let limit = self.schedule.max_bonds() as u64;
-                self.setup.note(|statistics| {
-                    statistics.max_bonds = Some(limit);
-                    statistics.last_failure = Some(message);
-                });
+                self.limit_bonds(bonds / 2);
+                self.setup.note(|statistics| statistics.last_failure = Some(message));
                 self.schedule.put_back(tickets);
             }
             Fault::Reported(message) if tickets.iter().any(|one| one.id == REFERENCE) => {
@@ -92,6 +88,32 @@ impl Running<'_> {
                 self.restart(fault);
             }
         }
+    }
+
+    /// Limits the bonds of batches of several structures, and keeps that for the next start.
+    pub fn limit_bonds(&mut self, bonds: usize) {
+        self.schedule.limit_bonds(bonds);
+        let limit = self.schedule.max_bonds();
+        self.setup.note(|statistics| statistics.max_bonds = Some(limit as u64));
+        if let Some(file) = &self.limit_file
+            && let Err(error) = file.write(limit)
+        {
+            warn!(%error, path = %file.path().display(), "cannot keep the size of batches for the next start");
+        }
+    }
+
+    /// Limits batches to the size that was found before, if there is one.
+    pub fn use_kept_limit(&mut self) {
+        let Some((file, bonds)) = self.limit_file.as_ref().and_then(|file| Some((file, file.read()?))) else {
+            return;
+        };
+        (self.progress)(&format!(
+            "batches of at most {bonds} bonds, which the memory of {} took before (kept in {})",
+            self.setup.settings.device,
+            file.path().display()
+        ));
+        self.schedule.limit_bonds(bonds);
+        self.setup.note(|statistics| statistics.max_bonds = Some(bonds as u64));
     }
 
     /// Ends the server and starts another one. Calls without results are sent again.

@@ -76,11 +76,11 @@ pub(crate) fn have_same_energies(found: &[f64], expected: &[f64]) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::description::{AdapterFeatures, PROTOCOL};
 
-    fn reference() -> ModelReference {
+    pub(crate) fn reference() -> ModelReference {
         let description = ModelDescription {
             protocol: PROTOCOL,
             adapter: "mace".to_owned(),

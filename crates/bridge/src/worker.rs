@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use tracing::info;
 
+use crate::batch_limit::LimitFile;
 use crate::description::{AdapterFeatures, ModelDescription};
 use crate::error::DeviceError;
 use crate::faults::Fault;
@@ -82,7 +83,8 @@ fn begin<'a>(
     let found = calls.round_trip(&[&reference], None).map_err(start_error)?;
     let energies = found.into_iter().next().map(|one| one.energies).unwrap_or_default();
     let limit = description.max_structures.unwrap_or(u32::MAX).min(setup.settings.max_batch.get());
-    let running = Running {
+    let limit_file = LimitFile::new(&setup.settings, &description);
+    let mut running = Running {
         setup,
         progress,
         server: Some(server),
@@ -90,6 +92,7 @@ fn begin<'a>(
         identity: description.identity.clone(),
         reference: (reference, energies.clone()),
         schedule: Schedule::new(limit as usize),
+        limit_file,
         clients: HashMap::new(),
         calls: HashMap::new(),
         sent: VecDeque::new(),
@@ -101,6 +104,7 @@ fn begin<'a>(
         started: Instant::now(),
         given_up: None,
     };
+    running.use_kept_limit();
     Ok((running, DeviceInfo { reference: ModelReference { description, energies }, self_test: report }))
 }
 
