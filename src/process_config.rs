@@ -52,8 +52,8 @@ pub enum AgentModel {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct AgentPythonModel {
-    /// How the program is started.
-    pub settings: PythonSettings,
+    /// How the program of each device is started.
+    pub settings: Vec<PythonSettings>,
     /// What the agent's program must say of its model.
     pub reference: ModelReference,
     /// Whether its results must have the same bits.
@@ -74,11 +74,11 @@ pub struct AgentPythonModel {
 pub enum WalkerModel {
     /// An export of GRACE.
     Grace(ModelFiles),
-    /// A model of the device of this host.
+    /// A model of a device of this host.
     Python(Box<DeviceModel>),
 }
 
-/// How a walker reaches a model of the device of its host.
+/// A model of the devices of a host.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct DeviceModel {
@@ -86,8 +86,6 @@ pub struct DeviceModel {
     pub description: ModelDescription,
     /// The artifact with the projection of its invariants, if they are projected.
     pub artifact: Option<HashedFile>,
-    /// Where calls go.
-    pub address: CallAddress,
 }
 
 /// A file whose content must not change.
@@ -110,6 +108,8 @@ pub struct WalkerConfig {
     pub connect_info: ConnectInfo,
     /// The model.
     pub model: WalkerModel,
+    /// Where calls of its device go, for a model in Python.
+    pub device: Option<CallAddress>,
     /// Threads that evaluate it.
     pub threads: usize,
     /// Dynamics, bias and guards.
@@ -237,12 +237,17 @@ impl AgentModel {
 }
 
 impl WalkerModel {
-    /// Loads the model of this process. Cancelling `stopping` ends calls of a device that does not answer.
-    pub fn load(&self, stopping: &CancellationToken) -> Result<Arc<dyn ModelWithFeatures>, CommandError> {
-        let DeviceModel { description, artifact, address } = match self {
+    /// Loads the model of this process, whose calls go to `device`. Cancelling `stopping` ends calls of a device that does not answer.
+    pub fn load(
+        &self,
+        device: Option<&CallAddress>,
+        stopping: &CancellationToken,
+    ) -> Result<Arc<dyn ModelWithFeatures>, CommandError> {
+        let DeviceModel { description, artifact } = match self {
             Self::Grace(files) => return Ok(files.load()?),
             Self::Python(model) => &**model,
         };
+        let address = device.ok_or_else(|| CommandError::input("the model has no device"))?;
         let model = PythonModel::shared(description.clone(), address.clone(), stopping.clone());
         let model = model.map_err(CommandError::Input)?;
         let Some(artifact) = artifact else { return Ok(Arc::new(model)) };

@@ -29,4 +29,4 @@ pub mod version_finds;
 pub mod versions;
 pub mod walk_ends;
 
-pub use snapshot::{DEVICE, Snapshot};
+pub use snapshot::{DEVICES, Snapshot};

@@ -37,14 +37,16 @@ impl LoadedCampaign {
         let (LoadedModel::Python(model), Some(largest)) = (&self.model, self.largest_seed_structure()) else {
             return Err(CommandError::input("the campaign has no model in Python, or no seed structure"));
         };
-        let device = model.device().ok_or_else(|| CommandError::input("the model has no device"))?;
         let potential = &self.config.potential;
         let settings = python.settings(potential.model.get_ref(), potential.precision);
-        let adapter = PythonSettings::adapter_file(&settings.adapter).map(|(file, _)| hashed(file));
+        let (Some(device), Some(first)) = (model.devices().first(), settings.first()) else {
+            return Err(CommandError::input("the model has no device"));
+        };
+        let adapter = PythonSettings::adapter_file(&first.adapter).map(|(file, _)| hashed(file));
         Ok(AgentPythonModel {
             reference: device.info().reference.clone(),
             is_reproducible: self.config.campaign.mode == CampaignMode::Reproducible,
-            model: settings.model.as_deref().filter(|path| path.is_file()).map(hashed).transpose()?,
+            model: first.model.as_deref().filter(|path| path.is_file()).map(hashed).transpose()?,
             adapter: adapter.transpose()?,
             artifact: model.projection().is_some().then(|| self.mixture_file()).transpose()?,
             largest: largest.clone(),

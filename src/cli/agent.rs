@@ -48,9 +48,9 @@ pub struct AgentArgs {
     #[arg(long, value_name = "DIR")]
     python_environment: Option<PathBuf>,
     /// Device that evaluates a model in Python on this host, such as cuda:1, if it is not that of the configuration
-    /// (potential.python.device)
-    #[arg(long, value_name = "NAME")]
-    device: Option<String>,
+    /// (potential.python.device). Repeat it for several devices
+    #[arg(long = "device", value_name = "NAME")]
+    devices: Vec<String>,
     /// Serve this agent's metrics to Prometheus at this address, such as 127.0.0.1:9465 (docs/metrics.md)
     #[arg(long, value_name = "ADDRESS:PORT", value_parser = web::address)]
     metrics: Option<SocketAddr>,
@@ -89,7 +89,7 @@ impl AgentArgs {
         };
         let absolute = |path: &PathBuf| std::path::absolute(path).map_err(CommandError::input);
         let environment = self.python_environment.as_ref().map(absolute).transpose()?;
-        let python = HostPython { environment, device: self.device };
+        let python = HostPython { environment, devices: self.devices };
         let watched = AgentState::default();
         block_on(async {
             if let Some(address) = self.metrics {

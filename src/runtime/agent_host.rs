@@ -95,8 +95,8 @@ async fn run_version(
         joined.newest().await.version()
     ));
     let skin = setup.settings.skin;
-    let device = match agent_model::start_device(&setup.model, python, skin, walkers, stop).await {
-        Ok(device) if !stop.is_cancelled() => device,
+    let devices = match agent_model::start_devices(&setup.model, python, skin, walkers, stop).await {
+        Ok(devices) if !stop.is_cancelled() => devices,
         ended => {
             joined.leave().await;
             return ended.map(|_| (ExitStatus::Interrupted, false));
@@ -104,10 +104,9 @@ async fn run_version(
     };
     let shm_dir = ShmDir::for_campaign(directory).map_err(CommandError::failed)?;
     let mixture = joined.newest().await;
-    // The walkers end with the device, too.
+    // The walkers end with a device, too.
     let (host_stop, asked) = (stop.child_token(), stop.clone());
-    let _watch =
-        DeviceWatch::start(device.as_ref(), None, &host_stop, "assignments go back to the orchestrator");
+    let _watch = DeviceWatch::start(&devices, None, &host_stop, "assignments go back to the orchestrator");
     let stopping = host_stop.clone();
     let metrics = Arc::clone(&state.metrics);
     let dispatch = |incoming| {
@@ -119,12 +118,12 @@ async fn run_version(
             OrchestratorEvent::Recovered => log_and_print("the orchestrator answers again"),
         }))
     };
-    let host = HostPlan { setup: &setup, walkers, threads, device: device.as_ref(), stop: &host_stop, state };
+    let host = HostPlan { setup: &setup, walkers, threads, devices: &devices, stop: &host_stop, state };
     let ended = host.run_in(&shm_dir, &mixture, dispatch).await;
     let removed = shm_dir.remove().map_err(CommandError::failed);
     let ended = ended?;
     removed?;
-    match device_watch::last_failure(device.as_ref()) {
+    match device_watch::last_failure(&devices) {
         Some(failure) if ended != ExitStatus::Done && !stop.is_cancelled() => {
             Err(CommandError::Failed(format!(
                 "{failure}\nthe assignments of this host went back to the orchestrator: mend the cause and start the agent again"
@@ -162,7 +161,7 @@ async fn join(
 struct AgentHost {
     walkers: Children,
     state: AgentState,
-    device: Option<Arc<Device>>,
+    devices: Vec<Arc<Device>>,
     line: ipc::ServerHandle,
     dispatching: DispatchTask,
     serving: JoinHandle<Result<(), IpcError>>,
@@ -177,7 +176,7 @@ struct HostPlan<'a> {
     setup: &'a AgentConfig,
     walkers: u32,
     threads: usize,
-    device: Option<&'a Arc<Device>>,
+    devices: &'a [Arc<Device>],
     stop: &'a CancellationToken,
     state: &'a AgentState,
 }
@@ -189,12 +188,11 @@ impl HostPlan<'_> {
         mixture: &Mixture,
         dispatch: impl FnOnce(mpsc::Receiver<Incoming>) -> DispatchTask,
     ) -> Result<ExitStatus, CommandError> {
-        let Self { setup, walkers, threads, device, stop, state } = self;
-        let sizes = HostSizes { walkers, message_bytes: setup.message_bytes, has_device: device.is_some() };
+        let Self { setup, walkers, threads, devices, stop, state } = self;
+        let sizes = HostSizes { walkers, message_bytes: setup.message_bytes, devices: devices.len() };
         let session = u64::from(std::process::id());
-        let memory = HostMemory::open(shm_dir, sizes, mixture, session, device)?;
-        let called = device.map(|device| &**device).zip(memory.device_address());
-        let model = agent_model::walker_model(&setup.model, called)?;
+        let memory = HostMemory::open(shm_dir, sizes, mixture, session, devices)?;
+        let (model, addresses) = (setup.model.for_walkers(), memory.addresses());
         let HostMemory { prepared: _prepared, mixture: shared, server, calls: _calls } = memory;
         let line = server.handle();
         let limits = Limits {
@@ -202,7 +200,7 @@ impl HostPlan<'_> {
             max_restarts: setup.max_restarts,
             ..Limits::default()
         };
-        let launch = walker_launcher(model, threads, setup.settings.clone(), line.clone());
+        let launch = walker_launcher(model, addresses, threads, setup.settings.clone(), line.clone());
         let walkers = Children::new(walkers, limits, launch);
         let (to_agent, incoming) = mpsc::channel(CHANNEL);
         let signs = walkers.heartbeats();
@@ -210,8 +208,8 @@ impl HostPlan<'_> {
             move |walker, useful| if useful { signs.delivered(walker) } else { signs.heartbeat(walker) };
         let serving = tokio::spawn(server.run(shared, to_agent, heard));
         let dispatching = dispatch(incoming);
-        let (state, device) = (state.clone(), device.cloned());
-        AgentHost { walkers, state, device, line, dispatching, serving, failed: None }.supervise(stop).await
+        let (state, devices) = (state.clone(), devices.to_vec());
+        AgentHost { walkers, state, devices, line, dispatching, serving, failed: None }.supervise(stop).await
     }
 }
 
@@ -247,11 +245,11 @@ impl AgentHost {
         }
     }
 
-    /// Publishes the states of walkers and device for the agent's metrics.
+    /// Publishes the states of walkers and devices for the agent's metrics.
     fn publish(&mut self) {
         *self.state.walkers.lock().unwrap_or_else(PoisonError::into_inner) = self.walkers.status();
-        let device = self.device.as_ref().map(|device| device.statistics());
-        *self.state.device.lock().unwrap_or_else(PoisonError::into_inner) = device;
+        let devices = device_watch::statistics(&self.devices);
+        *self.state.devices.lock().unwrap_or_else(PoisonError::into_inner) = devices;
     }
 
     /// Handles an event of a walker process. Returns whether all walkers have ended.

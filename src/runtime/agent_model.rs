@@ -7,7 +7,6 @@ use std::sync::Arc;
 use bridge::{Device, DeviceError, PythonSettings};
 use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
-use wire::ipc::CallAddress;
 use wire::net::{LinkError, Membership};
 
 use crate::exit_status::CommandError;
@@ -21,8 +20,8 @@ use crate::python_model;
 pub struct HostPython {
     /// Environment of the model's framework.
     pub environment: Option<PathBuf>,
-    /// Device that evaluates the model.
-    pub device: Option<String>,
+    /// Devices that evaluate the model. Empty: those of the configuration.
+    pub devices: Vec<String>,
 }
 
 /// Downloads the files of the model that are not on this host. `None` if this agent lost its membership meanwhile.
@@ -88,96 +87,94 @@ async fn has_file(joined: &Membership, file: &mut HashedFile, copy: PathBuf) -> 
 impl AgentPythonModel {
     /// Has the program use the files of this host.
     fn use_files(&mut self) {
-        if let Some(model) = &self.model {
-            self.settings.model = Some(model.path.clone());
-        }
-        let class = PythonSettings::adapter_file(&self.settings.adapter).map(|(_, class)| class.to_owned());
-        if let (Some(adapter), Some(class)) = (&self.adapter, class) {
-            self.settings.adapter = format!("{}:{class}", adapter.path.display());
+        for settings in &mut self.settings {
+            if let Some(model) = &self.model {
+                settings.model = Some(model.path.clone());
+            }
+            let class = PythonSettings::adapter_file(&settings.adapter).map(|(_, class)| class.to_owned());
+            if let (Some(adapter), Some(class)) = (&self.adapter, class) {
+                settings.adapter = format!("{}:{class}", adapter.path.display());
+            }
         }
     }
 
-    /// How the program is started on this host.
-    fn settings_here(&self, here: &HostPython) -> PythonSettings {
-        let mut settings = self.settings.clone();
+    /// How the program of each device is started on this host.
+    fn settings_here(&self, here: &HostPython) -> Vec<PythonSettings> {
+        let on = |device: &String| {
+            let first = self.settings.first().cloned();
+            first.map(|settings| PythonSettings { device: device.clone(), ..settings })
+        };
+        let mut settings = match here.devices.as_slice() {
+            [] => self.settings.clone(),
+            devices => devices.iter().filter_map(on).collect(),
+        };
         if let Some(environment) = &here.environment {
-            settings.environment.clone_from(environment);
-        }
-        if let Some(device) = &here.device {
-            settings.device.clone_from(device);
+            settings.iter_mut().for_each(|one| one.environment.clone_from(environment));
         }
         settings
     }
 
-    /// Checks that the model of a device of this host is the orchestrator's.
-    fn check(&self, device: &Device, settings: &PythonSettings) -> Result<(), CommandError> {
-        let wrong = |why: &str| {
-            let model = settings.model.as_deref().unwrap_or(Path::new("its model"));
-            let names = settings.names();
-            CommandError::Input(format!(
-                "{names}: {} is not the model of the orchestrator on this host: {why}",
-                model.display()
-            ))
-        };
-        let info = device.info();
-        self.reference.check(&info.reference, self.is_reproducible).map_err(|why| wrong(&why))?;
-        match python_model::irreproducible(&info.self_test, settings.max_batch.get()) {
-            Some(why) if self.is_reproducible => Err(CommandError::Input(format!(
-                "{}: the campaign is reproducible, but {why}",
-                settings.names()
-            ))),
+    /// Checks that the model of the devices of this host is the orchestrator's.
+    fn check(&self, devices: &[Arc<Device>], settings: &PythonSettings) -> Result<(), CommandError> {
+        let names = settings.names();
+        for device in devices {
+            self.reference.check(&device.info().reference, self.is_reproducible).map_err(|why| {
+                let model = settings.model.as_deref().unwrap_or(Path::new("its model")).display();
+                CommandError::Input(format!(
+                    "{names}: {model} is not the orchestrator's model on this host: {why}"
+                ))
+            })?;
+        }
+        match python_model::irreproducible(devices, settings.max_batch.get()) {
+            Some(why) if self.is_reproducible => {
+                Err(CommandError::Input(format!("{names}: the campaign is reproducible, but {why}")))
+            }
             _ => Ok(()),
         }
     }
 }
 
-/// Starts the device of a model in Python, if the model is one, and prepares it for the walkers. Cancelling `stop` ends that.
+/// Starts the devices of a model in Python, if the model is one, and prepares them for the walkers. Cancelling `stop` ends that.
 ///
 /// # Errors
 /// A program that does not start, or a model that is not the orchestrator's.
-pub async fn start_device(
+pub async fn start_devices(
     model: &AgentModel,
     here: &HostPython,
     skin: f64,
     walkers: u32,
     stop: &CancellationToken,
-) -> Result<Option<Arc<Device>>, CommandError> {
+) -> Result<Vec<Arc<Device>>, CommandError> {
     let AgentModel::Python(python) = model else {
-        let given = here.environment.is_some() || here.device.is_some();
+        let given = here.environment.is_some() || !here.devices.is_empty();
         let unused = "--python-environment and --device are for models in Python, but the campaign's is an export of GRACE";
-        return if given { Err(CommandError::input(unused)) } else { Ok(None) };
+        return if given { Err(CommandError::input(unused)) } else { Ok(Vec::new()) };
     };
     let settings = python.settings_here(here);
-    let (starting, stopping) = (settings.clone(), stop.clone());
-    let device = spawn_blocking(move || python_model::start(starting, &stopping)).await;
-    let device = match device.map_err(CommandError::failed)? {
-        Err(DeviceError::Stopped) => return Ok(None),
-        device => device.map_err(CommandError::input)?,
+    let (starting, same_bits, stopping) = (settings.clone(), python.is_reproducible, stop.clone());
+    let devices = spawn_blocking(move || python_model::start(starting, same_bits, &stopping)).await;
+    let devices = match devices.map_err(CommandError::failed)? {
+        Err(DeviceError::Stopped) => return Ok(Vec::new()),
+        devices => devices.map_err(CommandError::input)?,
     };
-    python.check(&device, &settings)?;
-    let described = device.info().description();
-    log_and_print(format_args!(
-        "python: {} on {}: the orchestrator's model",
-        described.adapter, described.device
-    ));
-    python_model::warm_up(&device, python.largest.clone(), skin, walkers).await?;
-    Ok(Some(device))
+    if let (Some(first), Some(device)) = (settings.first(), devices.first()) {
+        python.check(&devices, first)?;
+        let (adapter, names) = (&device.info().description().adapter, python_model::names(&devices));
+        log_and_print(format_args!("python: {adapter} on {names}: the orchestrator's model"));
+    }
+    python_model::warm_up(&devices, &python.largest, skin, walkers).await?;
+    Ok(devices)
 }
 
-/// What walkers load the model from. `device`: the device of a model in Python, and where its calls go.
-pub fn walker_model(
-    model: &AgentModel,
-    device: Option<(&Device, &CallAddress)>,
-) -> Result<WalkerModel, CommandError> {
-    match (model, device) {
-        (AgentModel::Grace(files), _) => Ok(WalkerModel::Grace(files.clone())),
-        (AgentModel::Python(python), Some((device, address))) => {
-            Ok(WalkerModel::Python(Box::new(DeviceModel {
-                description: device.info().description().clone(),
+impl AgentModel {
+    /// What walkers load the model from.
+    pub fn for_walkers(&self) -> WalkerModel {
+        match self {
+            Self::Grace(files) => WalkerModel::Grace(files.clone()),
+            Self::Python(python) => WalkerModel::Python(Box::new(DeviceModel {
+                description: python.reference.description.clone(),
                 artifact: python.artifact.clone(),
-                address: address.clone(),
-            })))
+            })),
         }
-        (AgentModel::Python(_), None) => Err(CommandError::failed("the model in Python has no device")),
     }
 }

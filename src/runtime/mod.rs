@@ -100,9 +100,10 @@ async fn run_walks(
         return Ok(reactor::RunOutcome::Stopped);
     }
     let RunContext { campaign, .. } = run;
-    if let (Some(device), Some(largest)) = (campaign.model.device(), campaign.largest_seed_structure()) {
+    let devices = campaign.model.devices();
+    if let Some(largest) = campaign.largest_seed_structure() {
         let (skin, walkers) = (campaign.config.walk.skin.get(), wanted_walkers(&campaign.config));
-        python_model::warm_up(device, largest.clone(), skin, walkers).await?;
+        python_model::warm_up(devices, largest, skin, walkers).await?;
     }
     let order = LabelOrderTask::start(run).await?;
     let completion = order.completion.clone();
@@ -110,7 +111,7 @@ async fn run_walks(
         true => single_process::run(run, selector, completion).await,
         false => multi_process::run(run, selector, completion).await,
     };
-    match device_watch::last_failure(campaign.model.device()) {
+    match device_watch::last_failure(devices) {
         Some(failure) => Err(CommandError::Failed(format!(
             "walks ended because {failure}\nwalks keep their checkpoints: run the same command to continue the campaign"
         ))),

@@ -59,7 +59,7 @@ fn host_sizes(campaign: &LoadedCampaign) -> HostSizes {
     HostSizes {
         walkers: wanted_walkers(&campaign.config),
         message_bytes: campaign.largest_message(),
-        has_device: campaign.model.device().is_some(),
+        devices: campaign.model.devices().len(),
     }
 }
 
@@ -70,9 +70,9 @@ async fn run_in(
     completion: CompletionModels,
 ) -> Result<reactor::RunOutcome, CommandError> {
     let RunContext { campaign, store, process, .. } = run;
-    let (mixture, device) = (Arc::clone(selector.mixture()), campaign.model.device());
-    let memory = HostMemory::open(place, host_sizes(campaign), &mixture, session(process), device)?;
-    let model = campaign.walker_model(memory.device_address())?;
+    let (mixture, devices) = (Arc::clone(selector.mixture()), campaign.model.devices());
+    let memory = HostMemory::open(place, host_sizes(campaign), &mixture, session(process), devices)?;
+    let (model, addresses) = (campaign.walker_model()?, memory.addresses());
     let HostMemory { prepared: _prepared, mixture: shared, server, calls: _calls } = memory;
     // The manager cancels it too, when the run cannot go on.
     let stopping = run.stop.child_token();
@@ -83,7 +83,7 @@ async fn run_in(
     };
     let line = server.handle();
     let threads = campaign.config.run.threads_per_walker.get();
-    let launch = walker_launcher(model, threads, campaign.walk_settings(), line.clone());
+    let launch = walker_launcher(model, addresses, threads, campaign.walk_settings(), line.clone());
     let walkers = Children::new(wanted_walkers(&campaign.config), limits, launch);
     let limits = Limits {
         heartbeat_timeout: limits.heartbeat_timeout.max(LABELLER_TIMEOUT),
@@ -103,7 +103,7 @@ async fn run_in(
         tokio::try_join!(async { local.await.map_err(CommandError::failed) }, remote).map(|_| ())
     });
     let walks = stopping.child_token();
-    let _watch = DeviceWatch::start(device, Some(store), &walks, LABELS_GO_ON);
+    let _watch = DeviceWatch::start(devices, Some(store), &walks, LABELS_GO_ON);
     let reactor = start_reactor(run, selector, incoming, walks, completion);
     supervise(manager, reactor, no_more_work, serving, run).await
 }
@@ -164,7 +164,7 @@ async fn supervise(
                     }
                     Ok(reactor::RunOutcome::Stopped)
                         if !stop_requested
-                            && device_watch::last_failure(campaign.model.device()).is_some() =>
+                            && device_watch::last_failure(campaign.model.devices()).is_some() =>
                     {
                         manager.wait_for_labels();
                     }

@@ -85,8 +85,8 @@ impl Tasks {
         let reactor = start_reactor(run, selector, incoming, stopping.clone(), completion);
         let external_labels = labellers.is_empty().then(|| run.store.clone());
         let superseded = run.superseded.clone();
-        let device = run.campaign.model.device();
-        let _watch = DeviceWatch::start(device, Some(run.store), &stopping, LABELS_GO_ON);
+        let devices = run.campaign.model.devices();
+        let _watch = DeviceWatch::start(devices, Some(run.store), &stopping, LABELS_GO_ON);
         Ok(Self { walkers, labellers, reactor, superseded, external_labels, closing, stopping, _watch })
     }
 

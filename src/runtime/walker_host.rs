@@ -22,8 +22,8 @@ pub struct HostSizes {
     pub walkers: u32,
     /// Largest message of a walker, bytes. It has the features of all atoms, as the largest reply of a device has.
     pub message_bytes: usize,
-    /// Whether walkers call a device.
-    pub has_device: bool,
+    /// Number of devices that walkers call.
+    pub devices: usize,
 }
 
 /// The open shared memory of a host.
@@ -32,8 +32,8 @@ pub struct HostMemory {
     pub mixture: SharedMixture,
     /// Their messages.
     pub server: IpcServer,
-    /// Their calls of the device, if there is one.
-    pub calls: Option<DeviceService>,
+    /// Their calls of each device.
+    pub calls: Vec<DeviceService>,
     /// Keeps the directory.
     pub prepared: PreparedDir,
 }
@@ -45,8 +45,13 @@ impl HostSizes {
     /// Sizes that overflow.
     pub fn space_needed(self, mixture: &Mixture) -> Result<u64, CommandError> {
         let mixture = SharedMixture::space_needed(mixture, self.walkers).map_err(CommandError::failed)?;
-        let calls = if self.has_device { call_space_needed(self.walkers, self.call_words()) } else { 0 };
+        let calls = call_space_needed(self.callers(), self.call_words()) * self.devices as u64;
         Ok(mixture + space_needed(&self.messages()) + calls)
+    }
+
+    /// Walkers of a device.
+    fn callers(self) -> u32 {
+        self.walkers.div_ceil(self.devices.max(1) as u32)
     }
 
     fn messages(self) -> Sizes {
@@ -68,26 +73,29 @@ impl HostMemory {
         sizes: HostSizes,
         mixture: &Mixture,
         session: u64,
-        device: Option<&Arc<Device>>,
+        devices: &[Arc<Device>],
     ) -> Result<Self, CommandError> {
         let prepared = place.prepare(sizes.space_needed(mixture)?).map_err(CommandError::failed)?;
         let mixture = SharedMixture::create(&place.mixture(), mixture, sizes.walkers);
         let mixture = mixture.map_err(CommandError::failed)?;
         let server = IpcServer::open(place, sizes.messages(), session).map_err(CommandError::failed)?;
-        let open = |device| DeviceService::open(device, place, session, sizes.walkers, sizes.call_words());
-        let calls = device.map(open).transpose().map_err(CommandError::failed)?;
+        let calls = devices.iter().zip(session..).map(|(device, session)| {
+            DeviceService::open(device, place, session, sizes.callers(), sizes.call_words())
+        });
+        let calls = calls.collect::<Result<_, _>>().map_err(CommandError::failed)?;
         Ok(Self { mixture, server, calls, prepared })
     }
 
-    /// Where calls of the device go.
-    pub fn device_address(&self) -> Option<&CallAddress> {
-        self.calls.as_ref().map(DeviceService::address)
+    /// Where the calls of each device go.
+    pub fn addresses(&self) -> Vec<CallAddress> {
+        self.calls.iter().map(|calls| calls.address().clone()).collect()
     }
 }
 
-/// Returns the function that launches a walker.
+/// Returns the function that launches a walker. Walkers are dealt evenly over `devices`.
 pub fn walker_launcher(
     model: WalkerModel,
+    devices: Vec<CallAddress>,
     threads: usize,
     settings: WalkSettings,
     line: ServerHandle,
@@ -95,10 +103,12 @@ pub fn walker_launcher(
     let parent = std::process::id();
     move |number, incarnation| {
         line.expect(number, incarnation);
+        let device = devices.get(number as usize % devices.len().max(1)).cloned();
         let setup = WalkerConfig {
             parent,
             connect_info: line.connect_info(number, incarnation),
             model: model.clone(),
+            device,
             threads,
             settings: settings.clone(),
             log: log::child_config(),

@@ -23,8 +23,8 @@ pub struct AgentState {
     pub metrics: Arc<Mutex<AgentMetrics>>,
     /// Its walkers.
     pub walkers: Arc<Mutex<Vec<ChildStatus>>>,
-    /// Its device, for a model in Python.
-    pub device: Arc<Mutex<Option<DeviceStatistics>>>,
+    /// Its devices, for a model in Python.
+    pub devices: Arc<Mutex<Vec<DeviceStatistics>>>,
 }
 
 /// Serves the metrics of an agent.
@@ -35,11 +35,11 @@ pub fn router(state: AgentState) -> Router {
 async fn metrics(State(state): State<AgentState>) -> Response {
     let metrics = state.metrics.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let walkers = state.walkers.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let device = state.device.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    ([(header::CONTENT_TYPE, CONTENT_TYPE)], text(&metrics, &walkers, device.as_ref())).into_response()
+    let devices = state.devices.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    ([(header::CONTENT_TYPE, CONTENT_TYPE)], text(&metrics, &walkers, &devices)).into_response()
 }
 
-fn text(metrics: &AgentMetrics, walkers: &[ChildStatus], device: Option<&DeviceStatistics>) -> String {
+fn text(metrics: &AgentMetrics, walkers: &[ChildStatus], devices: &[DeviceStatistics]) -> String {
     let mut text = MetricsText::default();
     let host = store::this_host();
     let labels = [("host", host.as_str()), ("version", env!("CARGO_PKG_VERSION"))];
@@ -54,9 +54,7 @@ fn text(metrics: &AgentMetrics, walkers: &[ChildStatus], device: Option<&DeviceS
         version,
     );
     link_metrics(&mut text, metrics);
-    if let Some(device) = device {
-        device_metrics(&mut text, device);
-    }
+    device_metrics(&mut text, devices);
     text.into_string()
 }
 

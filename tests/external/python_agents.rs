@@ -55,7 +55,7 @@ fn write_environment(here: &Path, name: &str) {
 fn hosts(line: &str) -> (Hosts, Outcome) {
     let home = tempfile::tempdir().unwrap();
     write_files(home.path(), line);
-    let (expected, _) = run_in_one_process(|directory| write_files(directory, ""));
+    let (expected, _) = run_in_one_process(|directory| write_files(directory, line));
     (Hosts::at(home, 1), expected)
 }
 
@@ -84,7 +84,7 @@ fn an_agent_evaluates_a_model_in_python() {
         assert!(said.contains(&format!("{file} of the orchestrator is not on this host")), "{said}");
     }
     assert!(said.contains("on simulated:1: the orchestrator's model"), "{said}");
-    assert_eq!(outcome(hosts.home.path()), expected);
+    assert!(outcome(hosts.home.path()) == expected, "another outcome");
     fs::remove_file(environment).unwrap();
     hosts.assert_cleaned_up();
 }
@@ -105,7 +105,7 @@ fn an_agent_with_another_model_is_refused() {
     held.resume();
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.orchestrator_stderr());
     assert!(hosts.orchestrator_stderr().contains("left"), "{}", hosts.orchestrator_stderr());
-    assert_eq!(outcome(hosts.home.path()), expected);
+    assert!(outcome(hosts.home.path()) == expected, "another outcome");
     hosts.assert_cleaned_up();
 }
 
@@ -133,6 +133,6 @@ fn an_agent_whose_program_fails_returns_its_assignments() {
     fs::remove_file(hosts.home.path().join("broken")).unwrap();
     held.resume();
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.orchestrator_stderr());
-    assert_eq!(outcome(hosts.home.path()), expected);
+    assert!(outcome(hosts.home.path()) == expected, "another outcome");
     hosts.assert_cleaned_up();
 }

@@ -7,6 +7,8 @@ use std::process::Command;
 use std::thread::sleep;
 use std::time::Duration;
 
+use serde_json::Value;
+
 use crate::common::{Running, config, program, refuse, stderr, succeed};
 
 /// Least number of faults of the server in the campaign that is disturbed.
@@ -103,6 +105,35 @@ fn faults_of_the_server_change_nothing() {
     assert!(status.contains("simulated on cpu") && status.contains("restart"), "{status}");
 }
 
+/// Two devices have half of the walkers each, and the data set has the same bytes, with walkers in processes and in one process.
+#[test]
+fn several_devices_change_nothing() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_campaign(here, &adapter("radial", ""));
+    build(here);
+    succeed(here, ["run", "campaign.toml", "--directory", "one"]);
+    write_campaign(here, &adapter("simulated", "device = [\"simulated:0\", \"simulated:1\"]"));
+    succeed(here, ["run", "campaign.toml", "--directory", "two"]);
+    succeed(here, ["run", "campaign.toml", "--directory", "threads", "--in-process"]);
+    let one = export(here, "one");
+    for campaign in ["two", "threads"] {
+        assert!(export(here, campaign) == one, "{campaign}");
+        let json: Value = serde_json::from_str(&succeed(here, ["status", "--json", campaign])).unwrap();
+        let devices = json["devices"].as_array().unwrap();
+        assert_eq!(devices.len(), 2);
+        for (number, device) in devices.iter().enumerate() {
+            assert_eq!(device["device"], format!("simulated:{number}"));
+            assert!(device["structures"].as_u64().unwrap() > 100, "{campaign}: {device}");
+        }
+        let sum: u64 = devices.iter().map(|device| device["structures"].as_u64().unwrap()).sum();
+        assert_eq!(json["device"]["structures"], sum);
+    }
+    let status = succeed(here, ["status", "--all", "two"]);
+    assert!(status.contains("simulated on simulated:0, simulated:1: busy"), "{status}");
+    assert!(status.contains("simulated on simulated:1: busy"), "{status}");
+}
+
 /// One fault of the server of the campaign in this directory. Returns whether there was one.
 fn disturb(directory: &Path, number: u32) -> bool {
     let signal = |signal: &str| {
@@ -185,6 +216,8 @@ fn wrong_models_are_refused() {
         (adapter("nothing", ""), "nothing"),
         ("environment = \"/nowhere\"\nadapter = \"radial\"".to_owned(), "/nowhere"),
         (adapter("radial", "max_batch = 0"), "max_batch"),
+        (adapter("radial", "device = []"), "a list with at least one"),
+        (adapter("radial", "device = 1"), "a device such as"),
     ];
     for (python, expected) in wrong {
         write_campaign(here, &python);
