@@ -134,3 +134,23 @@ impl<'de> Deserialize<'de> for DeviceNames {
         deserializer.deserialize_any(DevicesVisitor)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_device_is_a_text_or_a_list() {
+        let read = |text: &str| serde_json::from_str::<DeviceNames>(text);
+        for (text, names) in
+            [("\"cuda\"", vec!["cuda"]), ("[\"cuda:0\",\"cuda:1\"]", vec!["cuda:0", "cuda:1"])]
+        {
+            let found = read(text).unwrap();
+            assert_eq!(found.names(), names);
+            assert_eq!(serde_json::to_string(&found).unwrap(), text);
+        }
+        for wrong in ["[]", "1", "[1]"] {
+            assert!(read(wrong).is_err(), "{wrong}");
+        }
+    }
+}
