@@ -61,15 +61,16 @@ impl Running<'_> {
     pub fn handle_fault(&mut self, fault: Fault, batch: DeviceBatch) {
         let tickets = batch.tickets();
         let bonds: usize = tickets.iter().map(|one| one.shape.bonds).sum();
+        let is_device = matches!(fault, Fault::Memory(_));
         match fault {
-            Fault::Memory(message) if tickets.len() > 1 => {
+            Fault::Memory(message) | Fault::Arena(message) if tickets.len() > 1 => {
                 warn!(
                     message,
                     structures = tickets.len(),
                     bonds,
                     "the device is short of memory: smaller batches"
                 );
-                self.limit_bonds(bonds / 2);
+                self.limit_bonds(bonds / 2, is_device);
                 self.setup.note(|statistics| statistics.last_failure = Some(message));
                 self.schedule.put_back(tickets);
             }
@@ -90,12 +91,12 @@ impl Running<'_> {
         }
     }
 
-    /// Limits the bonds of batches of several structures, and keeps that for the next start.
-    pub fn limit_bonds(&mut self, bonds: usize) {
+    /// Limits the bonds of batches of several structures. What the memory of the device takes is kept for the next start.
+    pub fn limit_bonds(&mut self, bonds: usize, is_device: bool) {
         self.schedule.limit_bonds(bonds);
         let limit = self.schedule.max_bonds();
         self.setup.note(|statistics| statistics.max_bonds = Some(limit as u64));
-        if let Some(file) = &self.limit_file
+        if let Some(file) = self.limit_file.as_ref().filter(|_| is_device)
             && let Err(error) = file.write(limit)
         {
             warn!(%error, path = %file.path().display(), "cannot keep the size of batches for the next start");

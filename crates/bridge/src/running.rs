@@ -302,9 +302,12 @@ impl Running<'_> {
             });
             match made {
                 Ok(()) => copies *= 2,
-                Err(Fault::Memory(message)) if copies > 1 => {
-                    info!(message, copies, "the memory of the device takes fewer structures");
-                    found = Some(bonds * copies / 2);
+                Err(short @ (Fault::Memory(_) | Fault::Arena(_))) if copies > 1 => {
+                    info!(
+                        message = short.message(),
+                        copies, "the memory of the device takes fewer structures"
+                    );
+                    found = Some((bonds * copies / 2, matches!(short, Fault::Memory(_))));
                     break;
                 }
                 Err(other) => {
@@ -313,8 +316,8 @@ impl Running<'_> {
                 }
             }
         }
-        if let Some(bonds) = found {
-            self.limit_bonds(bonds);
+        if let Some((bonds, is_device)) = found {
+            self.limit_bonds(bonds, is_device);
         }
         if let Some(fault) = fault {
             self.restart(fault);

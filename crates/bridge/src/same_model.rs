@@ -46,18 +46,21 @@ impl ModelReference {
 impl ModelDescription {
     /// What of another server's model is not as here: what was found and what was expected.
     fn differences(&self, found: &Self) -> Vec<String> {
-        let features =
-            |RawFeatures { form, blocks, .. }: &RawFeatures| format!("{form:?} in blocks of {blocks:?}");
-        let parts: [(&str, fn(&Self) -> String); 4] = [
-            ("hash", |one| one.identity.clone()),
-            ("elements", |one| one.elements.join(" ")),
-            ("cutoffs", |one| format!("{:?} Å", one.cutoffs)),
-            ("precision", |one| one.precision.clone()),
-        ];
-        let mut pairs: Vec<_> = parts.map(|(what, part)| (what, part(found), part(self))).into();
-        pairs.push(("features", features(&found.features), features(&self.features)));
-        let different = pairs.into_iter().filter(|(_, found, expected)| found != expected);
-        different.map(|(what, found, expected)| format!("{what} {found}, expected {expected}")).collect()
+        let facts = |one: &Self| {
+            let RawFeatures { form, blocks, .. } = &one.features;
+            [
+                ("hash", one.identity.clone()),
+                ("elements", one.elements.join(" ")),
+                ("cutoffs", format!("{:?} Å", one.cutoffs)),
+                ("features", format!("{form:?} in blocks of {blocks:?}")),
+                ("precision", one.precision.clone()),
+            ]
+        };
+        let pairs = facts(found).into_iter().zip(facts(self));
+        let different = pairs.filter(|(found, expected)| found != expected);
+        different
+            .map(|((what, found), (_, expected))| format!("{what} {found}, expected {expected}"))
+            .collect()
     }
 
     /// For instance `cuda:0 with python 3.11.7, torch 2.6.0`.
