@@ -1,5 +1,6 @@
 //! Loads and checks everything that a configuration names. `validate` stops there, and `run` starts with it.
 
+mod agent_setup;
 mod draft;
 mod geometry;
 mod known_structures;
@@ -17,7 +18,7 @@ mod walk_time;
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 
-use atoms::Repetition;
+use atoms::{Repetition, Structure};
 use calm::Artifact;
 use calm::forgetting::ForgettingAlarm;
 use monitor::reference_check::{self, KnownStructure};
@@ -188,10 +189,15 @@ impl LoadedCampaign {
         hashes.map(|(_, hash)| hash.clone()).unwrap_or_default()
     }
 
+    /// The seed structure with most atoms.
+    pub fn largest_seed_structure(&self) -> Option<&Structure> {
+        self.seed_structures.iter().map(|seed| &seed.plan.structure).max_by_key(|structure| structure.len())
+    }
+
     /// Size of the largest message between walker and selector, bytes: a candidate of the largest seed structure with
     /// the checkpoints of its walk (three states with velocities and forces) and the points of its trace.
     pub fn largest_message(&self) -> usize {
-        let atoms = self.seed_structures.iter().map(|named| named.plan.structure.len()).max().unwrap_or(0);
+        let atoms = self.largest_seed_structure().map_or(0, Structure::len);
         let features = self.artifact.mixture.dimension();
         let interval = self.config.walk.trace_interval;
         let points = self.config.run.steps_per_assignment.get().checked_div(interval).unwrap_or(0);

@@ -7,6 +7,7 @@ use bridge::{AdapterFeatures, Device, PythonModel};
 use calm::Projection;
 use potentials::ModelWithFeatures;
 use potentials::grace::{GraceModel, Precision, RadialPath};
+use tokio_util::sync::CancellationToken;
 
 use crate::config::Config;
 use crate::exit_status::CommandError;
@@ -58,9 +59,10 @@ impl LoadedModel {
         let model = potential.model.get_ref();
         let Some(python) = &potential.python else { return Self::load_export(model, potential.precision) };
         let wrong = |error: String| CommandError::Input(format!("{}: {error}", path.display()));
-        let device = python_model::start(python.settings(model, potential.precision));
-        let device = device.map_err(|error| wrong(error.to_string()))?;
-        Ok(Self::Python(Arc::new(PythonModel::local(device).map_err(wrong)?)))
+        let settings = python.settings(model, potential.precision);
+        let devices = python_model::start(settings, false, &CancellationToken::new());
+        let devices = devices.map_err(|error| wrong(error.to_string()))?;
+        Ok(Self::Python(Arc::new(PythonModel::local(devices).map_err(wrong)?)))
     }
 
     /// The model, for evaluators.
@@ -79,11 +81,11 @@ impl LoadedModel {
         }
     }
 
-    /// The device of a model in Python.
-    pub fn device(&self) -> Option<&Arc<Device>> {
+    /// The devices of a model in Python.
+    pub fn devices(&self) -> &[Arc<Device>] {
         match self {
-            Self::Grace(_) => None,
-            Self::Python(model) => model.device(),
+            Self::Grace(_) => &[],
+            Self::Python(model) => model.devices(),
         }
     }
 
@@ -92,8 +94,11 @@ impl LoadedModel {
         match self {
             Self::Grace(model) => model.description().architecture.to_string(),
             Self::Python(model) => {
-                let description = model.description();
-                format!("{} in Python, on {}", description.adapter, description.device)
+                format!(
+                    "{} in Python, on {}",
+                    model.description().adapter,
+                    python_model::names(model.devices())
+                )
             }
         }
     }

@@ -6,7 +6,8 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge::{ModelDescription, PythonModel};
+use atoms::Structure;
+use bridge::{ModelDescription, ModelReference, PythonModel, PythonSettings};
 use calm::Projection;
 use potentials::ModelWithFeatures;
 use potentials::grace::{GraceModel, Precision, RadialPath};
@@ -37,17 +38,47 @@ pub struct ModelFiles {
     pub precision: Precision,
 }
 
+/// The model of a campaign for agents, with paths of the orchestrator's host.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields, rename_all = "snake_case")]
+pub enum AgentModel {
+    /// An export of GRACE.
+    Grace(ModelFiles),
+    /// A model that a program of the agent evaluates.
+    Python(Box<AgentPythonModel>),
+}
+
+/// What an agent needs for a program of its own.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct AgentPythonModel {
+    /// How the program of each device is started.
+    pub settings: Vec<PythonSettings>,
+    /// What the agent's program must say of its model.
+    pub reference: ModelReference,
+    /// Whether its results must have the same bits.
+    pub is_reproducible: bool,
+    /// The model's file, if it is one file.
+    pub model: Option<HashedFile>,
+    /// The adapter's file, if it is one of the user.
+    pub adapter: Option<HashedFile>,
+    /// The artifact with the projection of its invariants, if they are projected.
+    pub artifact: Option<HashedFile>,
+    /// The largest seed structure, for the first batches.
+    pub largest: Structure,
+}
+
 /// The model of a walker.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, rename_all = "snake_case")]
 pub enum WalkerModel {
     /// An export of GRACE.
     Grace(ModelFiles),
-    /// A model of the device of this host.
+    /// A model of a device of this host.
     Python(Box<DeviceModel>),
 }
 
-/// How a walker reaches a model of the device of its host.
+/// A model of the devices of a host.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct DeviceModel {
@@ -55,8 +86,6 @@ pub struct DeviceModel {
     pub description: ModelDescription,
     /// The artifact with the projection of its invariants, if they are projected.
     pub artifact: Option<HashedFile>,
-    /// Where calls go.
-    pub address: CallAddress,
 }
 
 /// A file whose content must not change.
@@ -79,6 +108,8 @@ pub struct WalkerConfig {
     pub connect_info: ConnectInfo,
     /// The model.
     pub model: WalkerModel,
+    /// Where calls of its device go, for a model in Python.
+    pub device: Option<CallAddress>,
     /// Threads that evaluate it.
     pub threads: usize,
     /// Dynamics, bias and guards.
@@ -91,8 +122,8 @@ pub struct WalkerConfig {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct AgentConfig {
-    /// The model, with paths of the orchestrator's host.
-    pub model: ModelFiles,
+    /// The model.
+    pub model: AgentModel,
     /// Dynamics, bias and guards.
     pub settings: WalkSettings,
     /// Largest message of a walker, bytes.
@@ -193,13 +224,30 @@ impl ModelFiles {
     }
 }
 
+impl AgentModel {
+    /// All files that an agent downloads if they are not on its host.
+    pub fn files(&self) -> Vec<&HashedFile> {
+        match self {
+            Self::Grace(files) => files.files().collect(),
+            Self::Python(python) => {
+                [&python.model, &python.adapter, &python.artifact].into_iter().flatten().collect()
+            }
+        }
+    }
+}
+
 impl WalkerModel {
-    /// Loads the model of this process. Cancelling `stopping` ends calls of a device that does not answer.
-    pub fn load(&self, stopping: &CancellationToken) -> Result<Arc<dyn ModelWithFeatures>, CommandError> {
-        let DeviceModel { description, artifact, address } = match self {
+    /// Loads the model of this process, whose calls go to `device`. Cancelling `stopping` ends calls of a device that does not answer.
+    pub fn load(
+        &self,
+        device: Option<&CallAddress>,
+        stopping: &CancellationToken,
+    ) -> Result<Arc<dyn ModelWithFeatures>, CommandError> {
+        let DeviceModel { description, artifact } = match self {
             Self::Grace(files) => return Ok(files.load()?),
             Self::Python(model) => &**model,
         };
+        let address = device.ok_or_else(|| CommandError::input("the model has no device"))?;
         let model = PythonModel::shared(description.clone(), address.clone(), stopping.clone());
         let model = model.map_err(CommandError::Input)?;
         let Some(artifact) = artifact else { return Ok(Arc::new(model)) };

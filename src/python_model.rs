@@ -1,17 +1,93 @@
-//! Starts the programs of models in Python.
+//! Starts the programs of models in Python and prepares their devices.
 
 use std::sync::Arc;
+use std::thread;
 
-use bridge::{Device, DeviceError, PythonSettings};
+use atoms::Structure;
+use bridge::{Device, DeviceError, PythonSettings, SelfTestReport};
+use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
+use crate::exit_status::CommandError;
 use crate::output::log_and_print;
 
-/// Starts the program of a model, which ends with the last who uses it.
+/// A reason of [`irreproducible`].
+pub const NOT_DETERMINISTIC: &str = "the model gives other bits when a call is repeated";
+
+/// Starts the program of a model on each device, which ends with the last who uses it. Cancelling `stop` ends the start, and later
+/// restarts. With `same_bits`, all devices must give the same bits.
 ///
 /// # Errors
-/// A program that does not start, or a model whose derivatives are wrong.
-pub fn start(settings: PythonSettings) -> Result<Arc<Device>, DeviceError> {
-    let progress = |text: &str| log_and_print(format_args!("python: {text}"));
-    Device::start(settings, &CancellationToken::new(), progress).map(Arc::new)
+/// A program that does not start, a model whose derivatives are wrong, or one that is another on another device.
+pub fn start(
+    settings: Vec<PythonSettings>,
+    same_bits: bool,
+    stop: &CancellationToken,
+) -> Result<Vec<Arc<Device>>, DeviceError> {
+    let is_alone = settings.len() == 1;
+    let start_one = |settings: PythonSettings| {
+        let label = if is_alone { "python".to_owned() } else { format!("python, {}", settings.device) };
+        let progress = move |text: &str| log_and_print(format_args!("{label}: {text}"));
+        Device::start(settings, stop, progress).map(Arc::new)
+    };
+    let devices: Vec<Arc<Device>> = thread::scope(|scope| {
+        let starting: Vec<_> =
+            settings.into_iter().map(|settings| scope.spawn(|| start_one(settings))).collect();
+        let crashed = |_| Err(DeviceError::Server("a thread that starts a device has crashed".to_owned()));
+        starting.into_iter().map(|one| one.join().unwrap_or_else(crashed)).collect::<Result<_, _>>()
+    })?;
+    if let Some((first, others)) = devices.split_first() {
+        let expected = &first.info().reference;
+        for other in others {
+            expected.check(&other.info().reference, same_bits).map_err(|why| {
+                let names = [other, first].map(|one| one.info().description().device.clone());
+                DeviceError::Server(format!("the model on {} is not that on {}: {why}", names[0], names[1]))
+            })?;
+        }
+    }
+    Ok(devices)
+}
+
+/// Names of the devices, for messages.
+pub fn names(devices: &[Arc<Device>]) -> String {
+    let names: Vec<_> = devices.iter().map(|one| one.info().description().device.as_str()).collect();
+    names.join(", ")
+}
+
+/// Why results do not depend on the structure alone, in batches of at most `max_batch` structures; `None` if they do.
+pub fn irreproducible(devices: &[Arc<Device>], max_batch: u32) -> Option<&'static str> {
+    let all = |has: fn(&SelfTestReport) -> bool| devices.iter().all(|device| has(&device.info().self_test));
+    if !all(|test| test.is_deterministic) {
+        Some(NOT_DETERMINISTIC)
+    } else if !all(|test| test.is_batch_independent) && max_batch > 1 {
+        Some("the bits of a structure depend on those beside it in a batch")
+    } else {
+        None
+    }
+}
+
+/// Prepares devices for the calls of this many walkers with structures up to this size, if that is of use.
+///
+/// # Errors
+/// A crashed thread, or a structure that the model does not support.
+pub async fn warm_up(
+    devices: &[Arc<Device>],
+    largest: &Structure,
+    skin: f64,
+    walkers: u32,
+) -> Result<(), CommandError> {
+    let is_of_use = |device: &&Arc<Device>| {
+        let description = device.info().description();
+        description.device != "cpu" || description.padding
+    };
+    let most = (walkers as usize).div_ceil(devices.len().max(1));
+    let prepare = |device: &Arc<Device>| {
+        let (device, largest) = (Arc::clone(device), largest.clone());
+        spawn_blocking(move || device.warm_up(&largest, skin, most))
+    };
+    let works: Vec<_> = devices.iter().filter(is_of_use).map(prepare).collect();
+    for work in works {
+        work.await.map_err(CommandError::failed)?.map_err(CommandError::Failed)?;
+    }
+    Ok(())
 }

@@ -31,4 +31,4 @@ pub mod versions;
 pub mod walk_ends;
 pub mod walk_trace;
 
-pub use snapshot::{DEVICE, Snapshot};
+pub use snapshot::{DEVICES, Snapshot};

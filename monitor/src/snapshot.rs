@@ -17,8 +17,8 @@ use wire::DeviceStatistics;
 /// Version of the JSON format; incremented when a key is removed or changes its meaning.
 pub const FORMAT: u32 = 1;
 
-/// Metadata of the store: [`DeviceStatistics`].
-pub const DEVICE: &str = "device";
+/// Metadata of the store: [`DeviceStatistics`] of each device.
+pub const DEVICES: &str = "devices";
 
 /// The state of a campaign, read within a short time.
 #[derive(Debug)]
@@ -43,8 +43,8 @@ pub struct Snapshot {
     pub check: Option<ReferenceCheck>,
     /// Versions of the potential.
     pub versions: CampaignVersions,
-    /// What the device of the present or last run has done. `None` for models that this program evaluates.
-    pub device: Option<DeviceStatistics>,
+    /// What each device of the present or last run has done. Empty for models that this program evaluates.
+    pub devices: Vec<DeviceStatistics>,
 }
 
 impl Snapshot {
@@ -65,7 +65,7 @@ impl Snapshot {
             origin: Provenance::read(store).await?,
             check: ReferenceCheck::read(store).await?,
             versions: CampaignVersions::read(store, &status, &values).await?,
-            device: read_device(store).await?,
+            devices: read_devices(store).await?,
             mixture: MixtureValues(values),
             disk: DiskUse { bytes: store.size().await?, forecast },
             campaign,
@@ -87,7 +87,7 @@ impl Snapshot {
             end_reason,
             check,
             versions,
-            device,
+            devices,
         } = self;
         let mut json = serde_json::to_value(status)?;
         json["version"] = FORMAT.into();
@@ -108,15 +108,17 @@ impl Snapshot {
         json["reference_check"] = check.as_ref().map_or(Value::Null, ReferenceCheck::to_json);
         json["versions"] = json!(versions.all);
         json["refit"] = json!(versions.refit);
-        json["device"] = device.as_ref().map_or(Value::Null, device_json);
+        let total = DeviceStatistics::total(devices);
+        json["device"] = total.as_ref().map_or(Value::Null, device_json);
+        json["devices"] = devices.iter().map(device_json).collect();
         labels.add_to(&mut json, status);
         Ok(json)
     }
 }
 
-async fn read_device(store: &Store) -> Result<Option<DeviceStatistics>, StoreError> {
-    let text = store.metadata(DEVICE).await?;
-    Ok(text.and_then(|text| serde_json::from_str(&text).ok()))
+async fn read_devices(store: &Store) -> Result<Vec<DeviceStatistics>, StoreError> {
+    let text = store.metadata(DEVICES).await?;
+    Ok(text.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default())
 }
 
 /// The statistics with what follows from them.

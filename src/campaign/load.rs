@@ -13,6 +13,7 @@ use potentials::grace::{GraceModel, RadialPath, Threads};
 use potentials::{ModelWithFeatures, PotentialWithFeatures};
 use serde_json::Value;
 use store::Protocol;
+use tokio_util::sync::CancellationToken;
 use toml::Spanned;
 
 use super::loader::Loader;
@@ -24,7 +25,7 @@ use crate::config::{ConfigError, LabelMethod, OnInvalid, PotentialConfig, Warnin
 use crate::file_hash;
 use crate::label_method::{self, REFERENCE_FILE};
 use crate::loaded_model::LoadedModel;
-use crate::python_model;
+use crate::python_model::{self, NOT_DETERMINISTIC};
 
 /// Largest number of seed-structure atoms that are graded.
 const MAX_GRADED_ATOMS: usize = 256;
@@ -58,8 +59,10 @@ impl Loader<'_> {
                 let key = "potential.python".to_owned();
                 let at = location(self.path, self.text, &key);
                 let failed = |message| ConfigError::File { at, key, message };
-                let device = python_model::start(settings).map_err(|error| error.to_string());
-                let model = device.and_then(PythonModel::local).map_err(failed)?;
+                let same_bits = self.config.campaign.mode == CampaignMode::Reproducible;
+                let devices = python_model::start(settings, same_bits, &CancellationToken::new());
+                let devices = devices.map_err(|error| error.to_string());
+                let model = devices.and_then(PythonModel::local).map_err(failed)?;
                 self.check_python(&model)?;
                 LoadedModel::Python(Arc::new(model))
             }
@@ -89,20 +92,14 @@ impl Loader<'_> {
                 expected,
             });
         }
-        let Some(test) = model.device().map(|device| &device.info().self_test) else { return Ok(()) };
-        let alone = self.config.potential.python.as_ref().is_some_and(|python| python.max_batch.get() == 1);
-        let expected = if !test.is_deterministic {
-            "\"live\": the model gives other bits when a call is repeated"
-        } else if !test.is_batch_independent && !alone {
-            "\"live\", or potential.python.max_batch = 1: the bits of a structure depend on those beside it in a batch"
-        } else {
-            return Ok(());
-        };
+        let max_batch = self.config.potential.python.as_ref().map_or(1, |python| python.max_batch.get());
+        let Some(reason) = python_model::irreproducible(model.devices(), max_batch) else { return Ok(()) };
         if self.config.campaign.mode == CampaignMode::Live {
             return Ok(());
         }
         let key = "campaign.mode".to_owned();
-        let (found, expected) = ("\"reproducible\"".to_owned(), expected.to_owned());
+        let or = if reason == NOT_DETERMINISTIC { "" } else { ", or potential.python.max_batch = 1" };
+        let (found, expected) = ("\"reproducible\"".to_owned(), format!("\"live\"{or}: {reason}"));
         Err(ConfigError::Value { at: location(self.path, self.text, &key), key, found, expected })
     }
 

@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 
 use potentials::grace::GraceModel;
-use wire::ipc::CallAddress;
 
 use super::LoadedCampaign;
 use super::loader::Loader;
@@ -64,14 +63,14 @@ impl LoadedCampaign {
         Ok(ModelFiles { export, artifact, precision: self.config.potential.precision })
     }
 
-    /// What walkers of this host load the model from; `device`: where the calls of a model in Python go.
-    pub fn walker_model(&self, device: Option<&CallAddress>) -> Result<WalkerModel, CommandError> {
-        let (LoadedModel::Python(model), Some(address)) = (&self.model, device) else {
+    /// What walkers of this host load the model from.
+    pub fn walker_model(&self) -> Result<WalkerModel, CommandError> {
+        let LoadedModel::Python(model) = &self.model else {
             return Ok(WalkerModel::Grace(self.model_files()?));
         };
         let artifact = model.projection().is_some().then(|| self.mixture_file()).transpose()?;
         let description = model.description().clone();
-        Ok(WalkerModel::Python(Box::new(DeviceModel { description, artifact, address: address.clone() })))
+        Ok(WalkerModel::Python(Box::new(DeviceModel { description, artifact })))
     }
 
     /// The section `[refit]` with absolute paths and hashes.

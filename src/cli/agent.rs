@@ -11,6 +11,7 @@ use super::{CommandError, ExitStatus, block_on, duration_between};
 use crate::duration::Duration;
 use crate::log::LogArgs;
 use crate::output::log_and_warn;
+use crate::runtime::agent_model::HostPython;
 use crate::runtime::scratch_dir::{self, ScratchDir};
 use crate::runtime::{agent_host, cores};
 use crate::web::{self, agent_metrics::AgentState};
@@ -43,6 +44,13 @@ pub struct AgentArgs {
     /// Directory with authority.pem, certificate.pem and key.pem; required unless the endpoint is a loopback address
     #[arg(long, value_name = "DIR")]
     tls: Option<PathBuf>,
+    /// Environment of a model in Python on this host, if it is not that of the configuration (potential.python.environment)
+    #[arg(long, value_name = "DIR")]
+    python_environment: Option<PathBuf>,
+    /// Device that evaluates a model in Python on this host, such as cuda:1, if it is not that of the configuration
+    /// (potential.python.device). Repeat it for several devices
+    #[arg(long = "device", value_name = "NAME")]
+    devices: Vec<String>,
     /// Serve this agent's metrics to Prometheus at this address, such as 127.0.0.1:9465 (docs/metrics.md)
     #[arg(long, value_name = "ADDRESS:PORT", value_parser = web::address)]
     metrics: Option<SocketAddr>,
@@ -79,6 +87,9 @@ impl AgentArgs {
             walkers,
             prefetch: self.prefetch,
         };
+        let absolute = |path: &PathBuf| std::path::absolute(path).map_err(CommandError::input);
+        let environment = self.python_environment.as_ref().map(absolute).transpose()?;
+        let python = HostPython { environment, devices: self.devices };
         let watched = AgentState::default();
         block_on(async {
             if let Some(address) = self.metrics {
@@ -91,6 +102,7 @@ impl AgentArgs {
                 threads: self.threads as usize,
                 timeout: self.wait_timeout.get(),
                 directory: scratch.path(),
+                python,
             };
             agent_host::run(&settings, &watched).await
         })?

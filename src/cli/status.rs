@@ -19,6 +19,7 @@ use monitor::label_cost::SECONDS_PER_HOUR;
 use monitor::reference_check::ReferenceCheck;
 use monitor::walk_ends::WalkEnds;
 use store::{CampaignStatus, Candidates, Location, Store, unix_milliseconds};
+use wire::DeviceStatistics;
 
 use self::batch_jobs::BatchJobs;
 use self::page::{StatusLayout, cut};
@@ -104,7 +105,7 @@ fn write(
 }
 
 fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &StatusLayout) -> io::Result<()> {
-    let Snapshot { campaign, origin, status, mixture, disk, labels, check, versions, device, .. } = snapshot;
+    let Snapshot { campaign, origin, status, mixture, disk, labels, check, versions, devices, .. } = snapshot;
     let (name, mode) = (origin.as_ref().map_or("", |origin| &origin.name), &campaign.mode);
     let id = campaign.id.to_string();
     // Ids of candidates start with the same eight characters.
@@ -139,8 +140,10 @@ fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &StatusLayout) -> 
     if let Some(budget) = budget::describe(&status.budget) {
         page.titled(out, "budget", &budget)?;
     }
-    if let Some(device) = device.as_ref().filter(|_| page.is_unlimited()) {
-        page.titled(out, "device", &wording::device::describe(device))?;
+    if let Some(total) = DeviceStatistics::total(devices).filter(|_| page.is_unlimited()) {
+        page.titled(out, "device", &wording::device::describe(&total))?;
+        let each = devices.iter().filter(|_| devices.len() > 1);
+        each.map(wording::device::describe).try_for_each(|line| page.titled(out, "", &line))?;
     }
     page.titled(out, "disk", &describe_disk(disk, page, status))?;
     match end(snapshot) {

@@ -26,7 +26,7 @@ impl WalkerArgs {
         launcher::end_with_parent(setup.parent).map_err(CommandError::failed)?;
         let stopping = signals::stop_token()?;
         let threads = Threads::new(setup.threads).map_err(CommandError::failed)?;
-        let model = setup.model.load(&stopping)?;
+        let model = setup.model.load(setup.device.as_ref(), &stopping)?;
         let context = WalkContext { model, threads, settings: Arc::new(setup.settings) };
         let mut transport =
             IpcWalker::connect(&setup.connect_info, stopping).map_err(CommandError::failed)?;

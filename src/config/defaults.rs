@@ -8,6 +8,7 @@ use orchestrator::selector::UpdateProtocol;
 use store::LowerStateRule;
 use workers::labeller::LabelBounds;
 
+use super::python::DeviceNames;
 use crate::duration::Duration;
 
 pub fn positive(x: f64) -> Positive {
@@ -153,8 +154,8 @@ pub fn refit_attempts() -> NonZeroU32 {
     nonzero(3)
 }
 
-pub fn python_device() -> String {
-    "cpu".to_owned()
+pub fn python_device() -> DeviceNames {
+    DeviceNames::One("cpu".to_owned())
 }
 
 pub fn max_batch() -> NonZeroU32 {

@@ -1,12 +1,14 @@
 //! `[potential.python]`: a model that its own framework evaluates.
 
+use std::fmt;
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 
 use bridge::PythonSettings;
 use potentials::grace::Precision;
 use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use serde::de::{Error, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer, Serialize};
 
 use super::defaults;
 use crate::duration::Duration;
@@ -26,9 +28,9 @@ pub struct PythonSection {
     #[serde(default)]
     #[schemars(with = "std::collections::BTreeMap<String, serde_json::Value>")]
     pub options: serde_json::Map<String, serde_json::Value>,
-    /// Device that evaluates the model: `cpu`, `cuda`, `cuda:1`, ….
+    /// Device that evaluates the model: `cpu`, `cuda`, `cuda:1`, …; or a list of devices, over which walkers are dealt evenly.
     #[serde(default = "defaults::python_device")]
-    pub device: String,
+    pub device: DeviceNames,
     /// Number of processor threads of the program.
     #[serde(default = "defaults::repeats")]
     pub threads: NonZeroU32,
@@ -41,29 +43,35 @@ pub struct PythonSection {
     /// The same for the start, and for the first calls of each size, for which frameworks compile.
     #[serde(default = "defaults::compile_timeout")]
     pub compile_timeout: Duration,
-    /// Directory in which frameworks keep compiled programs for the next start. Default: none.
+    /// Directory in which frameworks keep compiled programs for the next start, and calmwalk the size of batches that the memory of the
+    /// device takes. Default: none.
     #[serde(default)]
     pub cache: Option<PathBuf>,
 }
 
 impl PythonSection {
-    /// The program, for this model.
-    pub fn settings(&self, model: &Path, precision: Precision) -> PythonSettings {
+    /// The program of each device, for this model.
+    pub fn settings(&self, model: &Path, precision: Precision) -> Vec<PythonSettings> {
         let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
-        PythonSettings {
+        let adapter = match PythonSettings::adapter_file(&self.adapter) {
+            Some((file, class)) => format!("{}:{class}", absolute(file).display()),
+            None => self.adapter.clone(),
+        };
+        let of_device = |device: &String| PythonSettings {
             environment: absolute(&self.environment),
             launcher: self.launcher.clone(),
-            adapter: self.adapter.clone(),
+            adapter: adapter.clone(),
             model: Some(absolute(model)),
             options: self.options.clone(),
-            device: self.device.clone(),
+            device: device.clone(),
             precision,
             threads: self.threads,
             max_batch: self.max_batch,
             timeout: self.timeout.get(),
             compile_timeout: self.compile_timeout.get(),
             cache: self.cache.as_deref().map(absolute),
-        }
+        };
+        self.device.names().iter().map(of_device).collect()
     }
 
     /// Resolves paths relative to the directory of the configuration.
@@ -72,8 +80,77 @@ impl PythonSection {
         if let Some(cache) = &mut self.cache {
             *cache = directory.join(&*cache);
         }
-        if let Some((file, class)) = self.adapter.rsplit_once(':').filter(|(file, _)| file.ends_with(".py")) {
+        if let Some((file, class)) = PythonSettings::adapter_file(&self.adapter) {
             self.adapter = format!("{}:{class}", directory.join(file).display());
+        }
+    }
+}
+
+/// The devices of a host: `"cuda"` or `["cuda:0", "cuda:1"]`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, JsonSchema)]
+#[serde(untagged)]
+pub enum DeviceNames {
+    /// One device.
+    One(String),
+    /// At least one, each with a program of its own.
+    Several(#[schemars(length(min = 1))] Vec<String>),
+}
+
+impl DeviceNames {
+    /// All names.
+    pub fn names(&self) -> &[String] {
+        match self {
+            Self::One(name) => std::slice::from_ref(name),
+            Self::Several(names) => names,
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for DeviceNames {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct DevicesVisitor;
+        impl<'de> Visitor<'de> for DevicesVisitor {
+            type Value = DeviceNames;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("a device such as \"cuda\", or a list with at least one")
+            }
+
+            fn visit_str<E: Error>(self, name: &str) -> Result<DeviceNames, E> {
+                Ok(DeviceNames::One(name.to_owned()))
+            }
+
+            fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<DeviceNames, A::Error> {
+                let mut names = Vec::new();
+                while let Some(name) = list.next_element()? {
+                    names.push(name);
+                }
+                if names.is_empty() {
+                    return Err(A::Error::invalid_length(0, &self));
+                }
+                Ok(DeviceNames::Several(names))
+            }
+        }
+        deserializer.deserialize_any(DevicesVisitor)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_device_is_a_text_or_a_list() {
+        let read = |text: &str| serde_json::from_str::<DeviceNames>(text);
+        for (text, names) in
+            [("\"cuda\"", vec!["cuda"]), ("[\"cuda:0\",\"cuda:1\"]", vec!["cuda:0", "cuda:1"])]
+        {
+            let found = read(text).unwrap();
+            assert_eq!(found.names(), names);
+            assert_eq!(serde_json::to_string(&found).unwrap(), text);
+        }
+        for wrong in ["[]", "1", "[1]"] {
+            assert!(read(wrong).is_err(), "{wrong}");
         }
     }
 }

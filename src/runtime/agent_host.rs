@@ -1,33 +1,33 @@
 //! Runs an agent: starts walkers as processes on this host and connects them to the orchestrator on another.
 
-use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::pin::pin;
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
+use bridge::Device;
 use calm::Mixture;
 use futures_util::FutureExt;
-use orchestrator::launcher::{self, Children, Launch};
+use orchestrator::launcher::{self, Children};
 use orchestrator::supervisor::{ChildState, Limits};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
-use wire::ipc::{self, IpcError, IpcServer, Sizes, space_needed};
-use wire::mixture::SharedMixture;
+use wire::ipc::{self, IpcError};
 use wire::net::{self, Address, AgentClient, LinkError, Membership, NetError, Tls};
 use wire::shm_dir::ShmDir;
 use wire::transport::Incoming;
 use workers::agent::{self, Agent, OrchestratorEvent};
 
+use super::agent_model::{self, HostPython};
+use super::device_watch::{self, DeviceWatch};
 use super::process_manager::all_failed_message;
+use super::walker_host::{HostMemory, HostSizes, walker_launcher};
 use super::{CHANNEL, STOP_MESSAGE};
 use crate::exit_status::{CommandError, ExitStatus};
-use crate::file_hash::verify_hash;
-use crate::log;
 use crate::output::{count, log_and_print, log_and_warn};
-use crate::process_config::{self, AgentConfig, HashedFile, ModelFiles, WalkerConfig, WalkerModel};
+use crate::process_config::AgentConfig;
 use crate::signals::cancel_on_signal;
 use crate::web::agent_metrics::AgentState;
 
@@ -49,6 +49,8 @@ pub struct AgentSettings<'a> {
     pub timeout: Duration,
     /// Where temporary files are kept.
     pub directory: &'a Path,
+    /// What is another one on this host than on the orchestrator's.
+    pub python: HostPython,
 }
 
 /// Works for a campaign until it is over or this process is asked to stop, with one version of the potential after the other.
@@ -72,7 +74,7 @@ async fn run_version(
     state: &AgentState,
     stop: &CancellationToken,
 ) -> Result<(ExitStatus, bool), CommandError> {
-    let AgentSettings { address, tls, agent, threads, timeout, directory } = settings;
+    let AgentSettings { address, tls, agent, threads, timeout, directory, python } = settings;
     let (agent, threads, timeout) = (agent.clone(), *threads, *timeout);
     let walkers = agent.walkers;
     let (client, joined, setup) = tokio::select! {
@@ -92,9 +94,20 @@ async fn run_version(
         count(walkers, "walker"),
         joined.newest().await.version()
     ));
+    let skin = setup.settings.skin;
+    let devices = match agent_model::start_devices(&setup.model, python, skin, walkers, stop).await {
+        Ok(devices) if !stop.is_cancelled() => devices,
+        ended => {
+            joined.leave().await;
+            return ended.map(|_| (ExitStatus::Interrupted, false));
+        }
+    };
     let shm_dir = ShmDir::for_campaign(directory).map_err(CommandError::failed)?;
     let mixture = joined.newest().await;
-    let (stopping, asked) = (stop.clone(), stop.clone());
+    // The walkers end with a device, too.
+    let (host_stop, asked) = (stop.child_token(), stop.clone());
+    let _watch = DeviceWatch::start(&devices, None, &host_stop, "assignments go back to the orchestrator");
+    let stopping = host_stop.clone();
     let metrics = Arc::clone(&state.metrics);
     let dispatch = |incoming| {
         tokio::spawn(Agent { client, joined, incoming, stopping, orchestrator_timeout: timeout, metrics }.run(move |event| match event {
@@ -105,11 +118,19 @@ async fn run_version(
             OrchestratorEvent::Recovered => log_and_print("the orchestrator answers again"),
         }))
     };
-    let ended = run_in(&shm_dir, &setup, (walkers, threads), &mixture, dispatch, stop, state).await;
+    let host = HostPlan { setup: &setup, walkers, threads, devices: &devices, stop: &host_stop, state };
+    let ended = host.run_in(&shm_dir, &mixture, dispatch).await;
     let removed = shm_dir.remove().map_err(CommandError::failed);
     let ended = ended?;
     removed?;
-    Ok((ended, setup.has_versions))
+    match device_watch::last_failure(&devices) {
+        Some(failure) if ended != ExitStatus::Done && !stop.is_cancelled() => {
+            Err(CommandError::Failed(format!(
+                "{failure}\nthe assignments of this host went back to the orchestrator: mend the cause and start the agent again"
+            )))
+        }
+        _ => Ok((ended, setup.has_versions)),
+    }
 }
 
 /// Waits until the orchestrator admits this agent, and loads what the walkers need.
@@ -129,58 +150,18 @@ async fn join(
                 "the orchestrator's configuration: {error}: run the same version of calmwalk on all hosts"
             ))
         })?;
-        match model(&joined, &setup.model, directory).await? {
+        match agent_model::with_files(&joined, setup.model.clone(), directory).await? {
             Some(model) => return Ok((client, joined, AgentConfig { model, ..setup })),
             None => log_and_print("the orchestrator has restarted: joining again"),
         }
     }
 }
 
-/// The files of the model: the orchestrator's if this host can read them, otherwise downloaded copies. `None` if this agent
-/// lost its membership before the download finished.
-async fn model(
-    joined: &Membership,
-    model: &ModelFiles,
-    directory: &Path,
-) -> Result<Option<ModelFiles>, CommandError> {
-    let Some(export) = file(joined, &model.export, directory.join("kokkos.npz")).await? else {
-        return Ok(None);
-    };
-    let mut found = ModelFiles { export, ..model.clone() };
-    if let Some(artifact) = &mut found.artifact {
-        let Some(copy) = file(joined, artifact, directory.join("gmm_artifacts.npz")).await? else {
-            return Ok(None);
-        };
-        *artifact = copy;
-    }
-    Ok(Some(found))
-}
-
-/// A file of the orchestrator, or its copy, which is downloaded to `path`.
-async fn file(
-    joined: &Membership,
-    file: &HashedFile,
-    path: PathBuf,
-) -> Result<Option<HashedFile>, CommandError> {
-    let hash = &file.hash;
-    if verify_hash(&file.path, hash).is_ok() {
-        return Ok(Some(file.clone()));
-    }
-    log_and_print("the orchestrator's model file is not on this host: downloading the model …");
-    let bytes = match joined.fetch_file(hash).await {
-        Err(LinkError::RejoinRequired(_)) => return Ok(None),
-        bytes => bytes.map_err(CommandError::failed)?,
-    };
-    fs::write(&path, bytes)
-        .map_err(|error| CommandError::Failed(format!("cannot write {}: {error}", path.display())))?;
-    verify_hash(&path, hash).map_err(CommandError::failed)?;
-    Ok(Some(HashedFile { path, hash: hash.clone() }))
-}
-
 /// The walkers of this host and the task that dispatches assignments to them.
 struct AgentHost {
     walkers: Children,
     state: AgentState,
+    devices: Vec<Arc<Device>>,
     line: ipc::ServerHandle,
     dispatching: DispatchTask,
     serving: JoinHandle<Result<(), IpcError>>,
@@ -190,57 +171,45 @@ struct AgentHost {
 
 type DispatchTask = JoinHandle<Result<agent::AgentExit, LinkError>>;
 
-async fn run_in(
-    shm_dir: &ShmDir,
-    setup: &AgentConfig,
-    (walkers, threads): (u32, usize),
-    mixture: &Mixture,
-    dispatch: impl FnOnce(mpsc::Receiver<Incoming>) -> DispatchTask,
-    stop: &CancellationToken,
-    state: &AgentState,
-) -> Result<ExitStatus, CommandError> {
-    let sizes = Sizes { walkers, message_bytes: setup.message_bytes };
-    let needed =
-        SharedMixture::space_needed(mixture, walkers).map_err(CommandError::failed)? + space_needed(&sizes);
-    let _prepared = shm_dir.prepare(needed).map_err(CommandError::failed)?;
-    let shared = SharedMixture::create(&shm_dir.mixture(), mixture, walkers).map_err(CommandError::failed)?;
-    let server =
-        IpcServer::open(shm_dir, sizes, u64::from(std::process::id())).map_err(CommandError::failed)?;
-    let line = server.handle();
-    let limits = Limits {
-        heartbeat_timeout: Duration::from_secs_f64(setup.heartbeat_timeout),
-        max_restarts: setup.max_restarts,
-        ..Limits::default()
-    };
-    let walkers = Children::new(walkers, limits, launch(setup, threads, line.clone()));
-    let (to_agent, incoming) = mpsc::channel(CHANNEL);
-    let signs = walkers.heartbeats();
-    let heard = move |walker, useful| if useful { signs.delivered(walker) } else { signs.heartbeat(walker) };
-    let serving = tokio::spawn(server.run(shared, to_agent, heard));
-    let dispatching = dispatch(incoming);
-    AgentHost { walkers, state: state.clone(), line, dispatching, serving, failed: None }
-        .supervise(stop)
-        .await
+/// What an agent runs on its host.
+struct HostPlan<'a> {
+    setup: &'a AgentConfig,
+    walkers: u32,
+    threads: usize,
+    devices: &'a [Arc<Device>],
+    stop: &'a CancellationToken,
+    state: &'a AgentState,
 }
 
-/// Returns the function that launches a walker.
-fn launch(
-    setup: &AgentConfig,
-    threads: usize,
-    line: ipc::ServerHandle,
-) -> impl FnMut(u32, u32) -> Launch + Send + 'static {
-    let (setup, parent) = (setup.clone(), std::process::id());
-    move |number, incarnation| {
-        line.expect(number, incarnation);
-        let setup = WalkerConfig {
-            parent,
-            connect_info: line.connect_info(number, incarnation),
-            model: WalkerModel::Grace(setup.model.clone()),
-            threads,
-            settings: setup.settings.clone(),
-            log: log::child_config(),
+impl HostPlan<'_> {
+    async fn run_in(
+        self,
+        shm_dir: &ShmDir,
+        mixture: &Mixture,
+        dispatch: impl FnOnce(mpsc::Receiver<Incoming>) -> DispatchTask,
+    ) -> Result<ExitStatus, CommandError> {
+        let Self { setup, walkers, threads, devices, stop, state } = self;
+        let sizes = HostSizes { walkers, message_bytes: setup.message_bytes, devices: devices.len() };
+        let session = u64::from(std::process::id());
+        let memory = HostMemory::open(shm_dir, sizes, mixture, session, devices)?;
+        let (model, addresses) = (setup.model.for_walkers(), memory.addresses());
+        let HostMemory { prepared: _prepared, mixture: shared, server, calls: _calls } = memory;
+        let line = server.handle();
+        let limits = Limits {
+            heartbeat_timeout: Duration::from_secs_f64(setup.heartbeat_timeout),
+            max_restarts: setup.max_restarts,
+            ..Limits::default()
         };
-        Launch::this_program(["walker"], process_config::to_bytes(&setup)).without_database()
+        let launch = walker_launcher(model, addresses, threads, setup.settings.clone(), line.clone());
+        let walkers = Children::new(walkers, limits, launch);
+        let (to_agent, incoming) = mpsc::channel(CHANNEL);
+        let signs = walkers.heartbeats();
+        let heard =
+            move |walker, useful| if useful { signs.delivered(walker) } else { signs.heartbeat(walker) };
+        let serving = tokio::spawn(server.run(shared, to_agent, heard));
+        let dispatching = dispatch(incoming);
+        let (state, devices) = (state.clone(), devices.to_vec());
+        AgentHost { walkers, state, devices, line, dispatching, serving, failed: None }.supervise(stop).await
     }
 }
 
@@ -254,10 +223,7 @@ impl AgentHost {
         while dispatched.is_none() || !gone {
             tokio::select! {
                 event = self.walkers.next() => gone |= self.handle(event),
-                _ = ticks.tick() => {
-                    let walkers = self.walkers.status();
-                    *self.state.walkers.lock().unwrap_or_else(PoisonError::into_inner) = walkers;
-                }
+                _ = ticks.tick() => self.publish(),
                 () = &mut stop_requested => self.walkers.stop(),
                 ended = &mut self.dispatching, if dispatched.is_none() => {
                     let ended = ended.map_err(CommandError::failed)?;
@@ -277,6 +243,13 @@ impl AgentHost {
                 None => Ok(ExitStatus::Interrupted),
             },
         }
+    }
+
+    /// Publishes the states of walkers and devices for the agent's metrics.
+    fn publish(&mut self) {
+        *self.state.walkers.lock().unwrap_or_else(PoisonError::into_inner) = self.walkers.status();
+        let devices = device_watch::statistics(&self.devices);
+        *self.state.devices.lock().unwrap_or_else(PoisonError::into_inner) = devices;
     }
 
     /// Handles an event of a walker process. Returns whether all walkers have ended.

@@ -15,7 +15,7 @@ use workers::labeller::HEARTBEAT_INTERVAL;
 use super::RunContext;
 use crate::exit_status::CommandError;
 use crate::output::{count, log_and_print, log_and_warn};
-use crate::process_config::{self, AgentConfig};
+use crate::process_config;
 
 /// Lets agents join if this run listens.
 pub struct AgentService {
@@ -35,25 +35,11 @@ impl AgentService {
         let (store, mixture) =
             (run.store.clone().with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT), Arc::clone(mixture));
         let Some(listen) = run.listen else { return Ok(Self { server: None, store, mixture }) };
-        let config = &run.campaign.config;
-        if config.potential.python.is_some() {
-            return Err(CommandError::input(
-                "agents on other hosts evaluate exported GRACE models only; expected a campaign without [potential.python], or run without \
-                 --listen",
-            ));
-        }
-        let model = run.campaign.model_files()?;
-        let files = model.files().map(|file| (file.hash.clone(), file.path.clone())).collect();
-        let setup = AgentConfig {
-            model,
-            settings: run.campaign.walk_settings(),
-            message_bytes: run.campaign.largest_message(),
-            heartbeat_timeout: config.run.heartbeat_timeout.seconds(),
-            max_restarts: config.run.max_restarts,
-            has_versions: config.refit.is_some(),
-        };
+        let setup = run.campaign.agent_config()?;
+        let files =
+            setup.model.files().into_iter().map(|file| (file.hash.clone(), file.path.clone())).collect();
         let bootstrap = AgentBootstrap { setup: process_config::to_bytes(&setup), files };
-        let heartbeat_timeout = config.run.agent_heartbeat_timeout.get();
+        let heartbeat_timeout = run.campaign.config.run.agent_heartbeat_timeout.get();
         let server =
             AgentServer::open(&listen.endpoint, listen.tls.as_ref(), session, heartbeat_timeout, bootstrap)
                 .await;

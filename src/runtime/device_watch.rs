@@ -1,91 +1,81 @@
-//! Watches the device of a model in Python: what it does, and what happens when its program fails for good: walks end, labels go on.
+//! Watches the devices of a model in Python: what they do, and what happens when a program fails for good: walks end, labels go on.
 
 use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
 
 use bridge::Device;
-use monitor::DEVICE;
+use monitor::DEVICES;
 use store::Store;
 use tokio::task::JoinHandle;
 use tokio::time::interval;
 use tokio_util::sync::CancellationToken;
+use wire::DeviceStatistics;
 
-use crate::campaign::LoadedCampaign;
-use crate::exit_status::CommandError;
 use crate::output::log_and_print;
 
 /// Interval between writes of what the device has done.
 const WRITE_INTERVAL: Duration = Duration::from_secs(3);
 
-/// Ends the walks with the device, and writes what the device does to the store. Dropping it ends the watch.
-pub struct DeviceWatch(Option<JoinHandle<()>>);
+/// What follows for a campaign when a device has failed for good.
+pub const LABELS_GO_ON: &str = "no walk goes on, labels are still made";
+
+/// Ends the walks with a device, and writes what the devices do to a store. Dropping it ends the watch.
+pub struct DeviceWatch(Vec<JoinHandle<()>>);
 
 impl DeviceWatch {
-    /// Cancels `walks` when the device of the campaign's model, if it has one, has failed for good.
-    pub fn start(campaign: &LoadedCampaign, store: &Store, walks: &CancellationToken) -> Self {
-        let Some(device) = campaign.model.device() else { return Self(None) };
-        let (device, store, walks) = (Arc::clone(device), store.clone(), walks.clone());
-        Self(Some(tokio::spawn(async move {
-            let broken = device.broken().clone();
-            tokio::select! {
-                () = broken.cancelled() => {}
-                never = record(&device, &store) => match never {},
-            }
-            log_and_print("the model's program has failed for good: no walk goes on, labels are still made");
-            walks.cancel();
-            match record(&device, &store).await {}
-        })))
+    /// Cancels `walks` when one of the devices has failed for good, and says what follows from that.
+    pub fn start(
+        devices: &[Arc<Device>],
+        store: Option<&Store>,
+        walks: &CancellationToken,
+        consequence: &'static str,
+    ) -> Self {
+        let watch = |device: &Arc<Device>| {
+            let (broken, walks) = (device.broken().clone(), walks.clone());
+            let name = device.info().description().device.clone();
+            tokio::spawn(async move {
+                broken.cancelled().await;
+                log_and_print(format_args!(
+                    "the model's program on {name} has failed for good: {consequence}"
+                ));
+                walks.cancel();
+            })
+        };
+        let mut tasks: Vec<_> = devices.iter().map(watch).collect();
+        if let Some(store) = store.filter(|_| !devices.is_empty()) {
+            let (devices, store) = (devices.to_vec(), store.clone());
+            tasks.push(tokio::spawn(async move { match record(&devices, &store).await {} }));
+        }
+        Self(tasks)
     }
 }
 
-/// Writes what the device has done, for ever. Ignores errors: other writers report a broken database.
-async fn record(device: &Device, store: &Store) -> Infallible {
+/// What each device has done.
+pub fn statistics(devices: &[Arc<Device>]) -> Vec<DeviceStatistics> {
+    devices.iter().map(|device| device.statistics()).collect()
+}
+
+/// Writes what the devices have done, for ever. Ignores errors: other writers report a broken database.
+async fn record(devices: &[Arc<Device>], store: &Store) -> Infallible {
     let mut write = interval(WRITE_INTERVAL);
     loop {
         write.tick().await;
-        if let Ok(text) = serde_json::to_string(&device.statistics()) {
-            let _ = store.set_metadata(DEVICE, &text).await;
+        if let Ok(text) = serde_json::to_string(&statistics(devices)) {
+            let _ = store.set_metadata(DEVICES, &text).await;
         }
     }
 }
 
 impl Drop for DeviceWatch {
     fn drop(&mut self) {
-        if let Some(task) = &self.0 {
-            task.abort();
-        }
+        self.0.iter().for_each(JoinHandle::abort);
     }
 }
 
-/// Prepares the device of the campaign's model for the calls of this many walkers, if that is of use.
-///
-/// # Errors
-/// A crashed thread.
-pub async fn warm_up(campaign: &LoadedCampaign, walkers: u32) -> Result<(), CommandError> {
-    let Some(device) = campaign.model.device() else { return Ok(()) };
-    let description = &device.info().description;
-    if description.device == "cpu" && !description.padding {
-        return Ok(());
-    }
-    let seeds = campaign.seed_structures.iter().map(|seed| &seed.plan.structure);
-    let Some(largest) = seeds.max_by_key(|structure| structure.len()).cloned() else { return Ok(()) };
-    let (device, skin) = (Arc::clone(device), campaign.config.walk.skin.get());
-    let work = tokio::task::spawn_blocking(move || device.warm_up(&largest, skin, walkers as usize));
-    work.await.map_err(CommandError::failed)?.map_err(CommandError::Failed)
-}
-
-/// Whether the device of the campaign's model has failed for good.
-pub fn has_failed(campaign: &LoadedCampaign) -> bool {
-    campaign.model.device().is_some_and(|device| device.broken().is_cancelled())
-}
-
-/// Why, as the error of the run.
-pub fn failure(campaign: &LoadedCampaign) -> Option<CommandError> {
-    let device = campaign.model.device().filter(|device| device.broken().is_cancelled())?;
+/// Why a device has failed for good; `None` if none has.
+pub fn last_failure(devices: &[Arc<Device>]) -> Option<String> {
+    let device = devices.iter().find(|device| device.broken().is_cancelled())?;
     let reason = device.statistics().last_failure.unwrap_or_default();
-    Some(CommandError::Failed(format!(
-        "walks ended because the model's program failed three times in a row; the last time: {reason}\nwalks keep their checkpoints: \
-         run the same command to continue the campaign"
-    )))
+    Some(format!("the model's program failed three times in a row; the last time: {reason}"))
 }

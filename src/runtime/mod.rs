@@ -1,6 +1,7 @@
 //! Runs a campaign: walkers and labellers in separate processes, or everything in one process.
 
 pub mod agent_host;
+pub mod agent_model;
 mod agent_service;
 mod db_status;
 mod device_watch;
@@ -20,6 +21,7 @@ mod spawn;
 mod throughput;
 pub mod time_budget;
 pub mod version_loop;
+mod walker_host;
 
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
@@ -41,6 +43,7 @@ use crate::exit_status::CommandError;
 use crate::forgetting::ForgettingRule;
 use crate::output::count;
 use crate::progress::RunDisplay;
+use crate::python_model;
 pub use listen::Listen;
 pub use multi_process::shared_memory_needed;
 
@@ -96,14 +99,24 @@ async fn run_walks(
     if !go_on {
         return Ok(reactor::RunOutcome::Stopped);
     }
-    device_watch::warm_up(run.campaign, wanted_walkers(&run.campaign.config)).await?;
+    let RunContext { campaign, .. } = run;
+    let devices = campaign.model.devices();
+    if let Some(largest) = campaign.largest_seed_structure() {
+        let (skin, walkers) = (campaign.config.walk.skin.get(), wanted_walkers(&campaign.config));
+        python_model::warm_up(devices, largest, skin, walkers).await?;
+    }
     let order = LabelOrderTask::start(run).await?;
     let completion = order.completion.clone();
     let ended = match mode.in_process {
         true => single_process::run(run, selector, completion).await,
         false => multi_process::run(run, selector, completion).await,
     };
-    device_watch::failure(run.campaign).map_or(ended, Err)
+    match device_watch::last_failure(devices) {
+        Some(failure) => Err(CommandError::Failed(format!(
+            "walks ended because {failure}\nwalks keep their checkpoints: run the same command to continue the campaign"
+        ))),
+        None => ended,
+    }
 }
 
 /// The task that runs the reactor.

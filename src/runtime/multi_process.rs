@@ -6,7 +6,6 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge::DeviceService;
 use calm::Mixture;
 use orchestrator::launcher::Children;
 use orchestrator::reactor;
@@ -17,15 +16,14 @@ use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinHandle};
 use tokio::time::{Sleep, sleep};
 use tokio_util::sync::CancellationToken;
-use wire::ipc::{IpcServer, Sizes, call_space_needed, space_needed};
-use wire::mixture::SharedMixture;
 use wire::net::StopTokens;
 use wire::shm_dir::ShmDir;
 
 use super::agent_service::AgentService;
-use super::device_watch::{self, DeviceWatch};
+use super::device_watch::{self, DeviceWatch, LABELS_GO_ON};
 use super::label_order::CompletionModels;
 use super::process_manager::{self, ProcessManager};
+use super::walker_host::{HostMemory, HostSizes, walker_launcher};
 use super::{CHANNEL, ReactorTask, RunContext, spawn, start_reactor, wanted_walkers};
 use crate::campaign::LoadedCampaign;
 use crate::exit_status::CommandError;
@@ -52,24 +50,17 @@ pub async fn run(
     Ok(ended)
 }
 
-/// Shared memory for the messages and the mixture of a campaign when it starts, bytes.
+/// Shared memory that a campaign needs when it starts, bytes.
 pub fn shared_memory_needed(campaign: &LoadedCampaign, mixture: &Mixture) -> Result<u64, CommandError> {
-    let mixture = SharedMixture::space_needed(mixture, wanted_walkers(&campaign.config))
-        .map_err(CommandError::failed)?;
-    let calls = match campaign.config.potential.python {
-        Some(_) => call_space_needed(wanted_walkers(&campaign.config), call_words(campaign)),
-        None => 0,
-    };
-    Ok(mixture + space_needed(&message_sizes(campaign)) + calls)
+    host_sizes(campaign).space_needed(mixture)
 }
 
-/// Size of the largest reply of a device: it has the features of all atoms, as a candidate has.
-fn call_words(campaign: &LoadedCampaign) -> usize {
-    campaign.largest_message() / 8
-}
-
-fn message_sizes(campaign: &LoadedCampaign) -> Sizes {
-    Sizes { walkers: wanted_walkers(&campaign.config), message_bytes: campaign.largest_message() }
+fn host_sizes(campaign: &LoadedCampaign) -> HostSizes {
+    HostSizes {
+        walkers: wanted_walkers(&campaign.config),
+        message_bytes: campaign.largest_message(),
+        devices: campaign.model.devices().len(),
+    }
 }
 
 async fn run_in(
@@ -79,19 +70,10 @@ async fn run_in(
     completion: CompletionModels,
 ) -> Result<reactor::RunOutcome, CommandError> {
     let RunContext { campaign, store, process, .. } = run;
-    let walkers = wanted_walkers(&campaign.config);
-    let mixture = Arc::clone(selector.mixture());
-    let sizes = message_sizes(campaign);
-    let needed = shared_memory_needed(campaign, &mixture)?;
-    let device = campaign.model.device();
-    let words = call_words(campaign);
-    let _prepared = place.prepare(needed).map_err(CommandError::failed)?;
-    let shared = SharedMixture::create(&place.mixture(), &mixture, walkers);
-    let shared = shared.map_err(CommandError::failed)?;
-    let server = IpcServer::open(place, sizes, session(process)).map_err(CommandError::failed)?;
-
-    let calls = device.map(|device| DeviceService::open(device, place, session(process), walkers, words));
-    let calls = calls.transpose().map_err(CommandError::failed)?;
+    let (mixture, devices) = (Arc::clone(selector.mixture()), campaign.model.devices());
+    let memory = HostMemory::open(place, host_sizes(campaign), &mixture, session(process), devices)?;
+    let (model, addresses) = (campaign.walker_model()?, memory.addresses());
+    let HostMemory { prepared: _prepared, mixture: shared, server, calls: _calls } = memory;
     // The manager cancels it too, when the run cannot go on.
     let stopping = run.stop.child_token();
     let limits = Limits {
@@ -100,11 +82,9 @@ async fn run_in(
         ..Limits::default()
     };
     let line = server.handle();
-    let walkers = Children::new(
-        walkers,
-        limits,
-        spawn::walker_launcher(campaign, line.clone(), calls.as_ref().map(DeviceService::address))?,
-    );
+    let threads = campaign.config.run.threads_per_walker.get();
+    let launch = walker_launcher(model, addresses, threads, campaign.walk_settings(), line.clone());
+    let walkers = Children::new(wanted_walkers(&campaign.config), limits, launch);
     let limits = Limits {
         heartbeat_timeout: limits.heartbeat_timeout.max(LABELLER_TIMEOUT),
         detached: true,
@@ -123,7 +103,7 @@ async fn run_in(
         tokio::try_join!(async { local.await.map_err(CommandError::failed) }, remote).map(|_| ())
     });
     let walks = stopping.child_token();
-    let _watch = DeviceWatch::start(campaign, store, &walks);
+    let _watch = DeviceWatch::start(devices, Some(store), &walks, LABELS_GO_ON);
     let reactor = start_reactor(run, selector, incoming, walks, completion);
     supervise(manager, reactor, no_more_work, serving, run).await
 }
@@ -183,7 +163,8 @@ async fn supervise(
                         manager.wait_for_labels();
                     }
                     Ok(reactor::RunOutcome::Stopped)
-                        if !stop_requested && device_watch::has_failed(campaign) =>
+                        if !stop_requested
+                            && device_watch::last_failure(campaign.model.devices()).is_some() =>
                     {
                         manager.wait_for_labels();
                     }

@@ -18,7 +18,7 @@ use workers::walk::WalkContext;
 use workers::walker;
 
 use super::db_status::DbStatus;
-use super::device_watch::DeviceWatch;
+use super::device_watch::{DeviceWatch, LABELS_GO_ON};
 use super::label_order::CompletionModels;
 use super::process_manager::LABEL_CHECK_INTERVAL;
 use super::spawn::stop_labellers;
@@ -85,7 +85,8 @@ impl Tasks {
         let reactor = start_reactor(run, selector, incoming, stopping.clone(), completion);
         let external_labels = labellers.is_empty().then(|| run.store.clone());
         let superseded = run.superseded.clone();
-        let _watch = DeviceWatch::start(run.campaign, run.store, &stopping);
+        let devices = run.campaign.model.devices();
+        let _watch = DeviceWatch::start(devices, Some(run.store), &stopping, LABELS_GO_ON);
         Ok(Self { walkers, labellers, reactor, superseded, external_labels, closing, stopping, _watch })
     }
 

@@ -1,4 +1,4 @@
-//! Launches the processes of a campaign and adopts running labellers.
+//! Launches the labellers of a campaign and adopts running ones.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -6,38 +6,12 @@ use std::path::{Path, PathBuf};
 use orchestrator::launcher::{Children, Launch, request_exit};
 use orchestrator::supervisor::Limits;
 use store::{ProcessRecord, Store, StoreError};
-use wire::ipc::{CallAddress, ServerHandle};
 
 use super::RunContext;
 use super::labellers::Labellers;
-use crate::campaign::LoadedCampaign;
 use crate::exit_status::CommandError;
 use crate::label_setup::LabelSetup;
-use crate::log;
-use crate::process_config::{self, LabellerConfig, WalkerConfig};
-
-/// Returns the function that launches a walker.
-pub fn walker_launcher(
-    campaign: &LoadedCampaign,
-    line: ServerHandle,
-    device: Option<&CallAddress>,
-) -> Result<impl FnMut(u32, u32) -> Launch + Send + 'static, CommandError> {
-    let model = campaign.walker_model(device)?;
-    let (parent, settings) = (std::process::id(), campaign.walk_settings());
-    let threads = campaign.config.run.threads_per_walker.get();
-    Ok(move |number, incarnation| {
-        line.expect(number, incarnation);
-        let setup = WalkerConfig {
-            parent,
-            connect_info: line.connect_info(number, incarnation),
-            model: model.clone(),
-            threads,
-            settings: settings.clone(),
-            log: log::child_config(),
-        };
-        Launch::this_program(["walker"], process_config::to_bytes(&setup)).without_database()
-    })
-}
+use crate::process_config::{self, LabellerConfig};
 
 /// Adopts the labellers that an earlier run left with the same configuration, and launches the missing ones.
 pub async fn start_labellers(run: RunContext<'_>, limits: Limits) -> Result<Labellers, CommandError> {

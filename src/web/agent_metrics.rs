@@ -10,9 +10,11 @@ use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use orchestrator::supervisor::{ChildState, ChildStatus};
+use wire::DeviceStatistics;
 use workers::agent::AgentMetrics;
 
 use super::exposition::{CONTENT_TYPE, MetricsText};
+use super::metrics::device_metrics;
 
 /// State of an agent. Clones share it.
 #[derive(Clone, Debug, Default)]
@@ -21,6 +23,8 @@ pub struct AgentState {
     pub metrics: Arc<Mutex<AgentMetrics>>,
     /// Its walkers.
     pub walkers: Arc<Mutex<Vec<ChildStatus>>>,
+    /// Its devices, for a model in Python.
+    pub devices: Arc<Mutex<Vec<DeviceStatistics>>>,
 }
 
 /// Serves the metrics of an agent.
@@ -31,10 +35,11 @@ pub fn router(state: AgentState) -> Router {
 async fn metrics(State(state): State<AgentState>) -> Response {
     let metrics = state.metrics.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let walkers = state.walkers.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    ([(header::CONTENT_TYPE, CONTENT_TYPE)], text(&metrics, &walkers)).into_response()
+    let devices = state.devices.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    ([(header::CONTENT_TYPE, CONTENT_TYPE)], text(&metrics, &walkers, &devices)).into_response()
 }
 
-fn text(metrics: &AgentMetrics, walkers: &[ChildStatus]) -> String {
+fn text(metrics: &AgentMetrics, walkers: &[ChildStatus], devices: &[DeviceStatistics]) -> String {
     let mut text = MetricsText::default();
     let host = store::this_host();
     let labels = [("host", host.as_str()), ("version", env!("CARGO_PKG_VERSION"))];
@@ -49,6 +54,7 @@ fn text(metrics: &AgentMetrics, walkers: &[ChildStatus]) -> String {
         version,
     );
     link_metrics(&mut text, metrics);
+    device_metrics(&mut text, devices);
     text.into_string()
 }
 

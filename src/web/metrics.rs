@@ -43,9 +43,7 @@ pub fn text(snapshot: &Snapshot) -> String {
     );
     candidates(&mut text, status);
     walks(&mut text, status);
-    if let Some(found) = &snapshot.device {
-        device(&mut text, found);
-    }
+    device_metrics(&mut text, &snapshot.devices);
     label_queue(&mut text, status);
     let failures: Vec<_> =
         snapshot.labels.failures.iter().map(|failure| [("class", failure.class.as_str())]).collect();
@@ -103,20 +101,35 @@ fn candidates(text: &mut MetricsText, status: &CampaignStatus) {
     text.gauge("calmwalk_mixture_version", "Version of the mixture in force.", &[(&[], version)]);
 }
 
-/// The device of a model in Python.
-fn device(text: &mut MetricsText, device: &DeviceStatistics) {
-    let mut counter = |name, help, value| text.counter(name, help, &[(&[], value)]);
-    counter("calmwalk_device_batches_total", "Batches that the device evaluated.", device.batches as f64);
-    counter("calmwalk_device_structures_total", "Structures in them.", device.structures as f64);
-    counter("calmwalk_device_bonds_total", "Directed bonds in them.", device.bonds as f64);
-    counter("calmwalk_device_busy_seconds_total", "Time for which the device had work.", device.busy);
-    counter("calmwalk_device_wait_seconds_total", "Time that calls waited for their batch.", device.waited);
-    counter("calmwalk_device_compile_seconds_total", "Time of batches of a new shape.", device.compiled);
-    counter("calmwalk_device_restarts_total", "Restarts of the model's program.", device.restarts as f64);
+/// The devices of a model in Python, if there are any.
+pub(super) fn device_metrics(text: &mut MetricsText, devices: &[DeviceStatistics]) {
+    if devices.is_empty() {
+        return;
+    }
+    // Several programs may be on one device.
+    let numbers: Vec<_> = (0..devices.len()).map(|number| number.to_string()).collect();
+    let labels: Vec<_> = numbers
+        .iter()
+        .zip(devices)
+        .map(|(number, one)| [("number", number.as_str()), ("device", one.device.as_str())])
+        .collect();
+    let samples = |value: fn(&DeviceStatistics) -> f64| -> Vec<_> {
+        labels.iter().zip(devices).map(|(labels, one)| (&labels[..], value(one))).collect()
+    };
+    let mut counter = |name, help, value| text.counter(name, help, &samples(value));
+    counter("calmwalk_device_batches_total", "Batches that the device evaluated.", |one| one.batches as f64);
+    counter("calmwalk_device_structures_total", "Structures in them.", |one| one.structures as f64);
+    counter("calmwalk_device_bonds_total", "Directed bonds in them.", |one| one.bonds as f64);
+    counter("calmwalk_device_busy_seconds_total", "Time for which the device had work.", |one| one.busy);
+    counter("calmwalk_device_wait_seconds_total", "Time that calls waited for their batch.", |one| {
+        one.waited
+    });
+    counter("calmwalk_device_compile_seconds_total", "Time of batches of a new shape.", |one| one.compiled);
+    counter("calmwalk_device_restarts_total", "Restarts of the model's program.", |one| one.restarts as f64);
     text.gauge(
         "calmwalk_device_busy_ratio",
         "Share of the time for which the device had work.",
-        &[(&[], device.busy_share())],
+        &samples(DeviceStatistics::busy_share),
     );
 }
 

@@ -36,6 +36,11 @@ impl Hosts {
         let path = Small { walkers: 1, ..small.clone() }.write(home.path());
         let text = fs::read_to_string(&path).unwrap();
         fs::write(&path, text.replace("[run]\n", &format!("[run]\n{keys}\n"))).unwrap();
+        Self::at(home, others)
+    }
+
+    /// The campaign in this directory.
+    pub fn at(home: TempDir, others: usize) -> Self {
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let endpoint = format!("tcp/127.0.0.1:{port}");
         let others = (0..others).map(|_| tempfile::tempdir().unwrap()).collect();

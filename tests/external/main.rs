@@ -13,6 +13,7 @@ mod gracemaker_refit;
 mod loaders;
 mod pictures;
 mod postgres_faults;
+mod python_agents;
 mod python_models;
 mod selection;
 mod slurm;

@@ -7,6 +7,8 @@ use std::process::Command;
 use std::thread::sleep;
 use std::time::Duration;
 
+use serde_json::Value;
+
 use crate::common::{Running, config, program, refuse, stderr, succeed};
 
 /// Least number of faults of the server in the campaign that is disturbed.
@@ -16,7 +18,7 @@ const FAULTS: u32 = 20;
 const CALLS_BETWEEN: usize = 60;
 
 /// A campaign on the radial model of the Python tests, with these lines in `[potential.python]`.
-fn write_campaign(directory: &Path, python: &str) {
+pub fn write_campaign(directory: &Path, python: &str) {
     let data = |file: &str| Path::new(env!("CARGO_MANIFEST_DIR")).join(file).display().to_string();
     let (model, seeds, eam) = (
         data("python/tests/data/radial-al.json"),
@@ -38,12 +40,12 @@ fn write_campaign(directory: &Path, python: &str) {
     fs::write(directory.join("campaign.toml"), text).unwrap();
 }
 
-fn adapter(name: &str, more: &str) -> String {
+pub fn adapter(name: &str, more: &str) -> String {
     let python = std::env::var("CALMWALK_PYTHON").expect("CALMWALK_PYTHON names a Python with numpy");
     format!("environment = {python:?}\nadapter = {name:?}\n{more}")
 }
 
-fn build(directory: &Path) {
+pub fn build(directory: &Path) {
     let frames = config("data/al_eam_1l/seed_frames.extxyz").display().to_string();
     let build = [
         "calm",
@@ -101,6 +103,35 @@ fn faults_of_the_server_change_nothing() {
     assert!(plain == disturbed, "{} and {} bytes", plain.len(), disturbed.len());
     let status = succeed(here, ["status", "--all", "disturbed"]);
     assert!(status.contains("simulated on cpu") && status.contains("restart"), "{status}");
+}
+
+/// Two devices have half of the walkers each, and the data set has the same bytes, with walkers in processes and in one process.
+#[test]
+fn several_devices_change_nothing() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_campaign(here, &adapter("radial", ""));
+    build(here);
+    succeed(here, ["run", "campaign.toml", "--directory", "one"]);
+    write_campaign(here, &adapter("simulated", "device = [\"simulated:0\", \"simulated:1\"]"));
+    succeed(here, ["run", "campaign.toml", "--directory", "two"]);
+    succeed(here, ["run", "campaign.toml", "--directory", "threads", "--in-process"]);
+    let one = export(here, "one");
+    for campaign in ["two", "threads"] {
+        assert!(export(here, campaign) == one, "{campaign}");
+        let json: Value = serde_json::from_str(&succeed(here, ["status", "--json", campaign])).unwrap();
+        let devices = json["devices"].as_array().unwrap();
+        assert_eq!(devices.len(), 2);
+        for (number, device) in devices.iter().enumerate() {
+            assert_eq!(device["device"], format!("simulated:{number}"));
+            assert!(device["structures"].as_u64().unwrap() > 100, "{campaign}: {device}");
+        }
+        let sum: u64 = devices.iter().map(|device| device["structures"].as_u64().unwrap()).sum();
+        assert_eq!(json["device"]["structures"], sum);
+    }
+    let status = succeed(here, ["status", "--all", "two"]);
+    assert!(status.contains("simulated on simulated:0, simulated:1: busy"), "{status}");
+    assert!(status.contains("simulated on simulated:1: busy"), "{status}");
 }
 
 /// One fault of the server of the campaign in this directory. Returns whether there was one.
@@ -185,6 +216,8 @@ fn wrong_models_are_refused() {
         (adapter("nothing", ""), "nothing"),
         ("environment = \"/nowhere\"\nadapter = \"radial\"".to_owned(), "/nowhere"),
         (adapter("radial", "max_batch = 0"), "max_batch"),
+        (adapter("radial", "device = []"), "a list with at least one"),
+        (adapter("radial", "device = 1"), "a device such as"),
     ];
     for (python, expected) in wrong {
         write_campaign(here, &python);

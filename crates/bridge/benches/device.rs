@@ -59,12 +59,12 @@ fn overhead(python: &Path) {
     let prepared = place.prepare(1 << 26).expect("shared memory");
     let service = DeviceService::open(&device, &place, 1, 2, 1 << 17).expect("a service");
     let shared = PythonModel::shared(
-        device.info().description.clone(),
+        device.info().description().clone(),
         service.address().clone(),
         CancellationToken::new(),
     );
     let models = [
-        ("in one process", projected(PythonModel::local(Arc::clone(&device)).expect("a model"))),
+        ("in one process", projected(PythonModel::local(vec![Arc::clone(&device)]).expect("a model"))),
         ("between processes", projected(shared.expect("a model"))),
     ];
     println!("calls with 500 atoms, ms      whole call   adapter   overhead");
@@ -98,7 +98,7 @@ fn compare(settings: &PythonSettings, walkers: usize, repeats: usize, time: Dura
         let mut settings = settings.clone();
         settings.max_batch = max_batch.try_into().expect("above zero");
         let device = start(settings);
-        let model = projected(PythonModel::local(Arc::clone(&device)).expect("a model"));
+        let model = projected(PythonModel::local(vec![Arc::clone(&device)]).expect("a model"));
         let _ = device.warm_up(&crystal(repeats, 0), 0.5, walkers);
         let before = device.statistics();
         let end = Instant::now() + time;

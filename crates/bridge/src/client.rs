@@ -14,8 +14,8 @@ use crate::recipient::read_answer;
 
 /// How a model reaches its device.
 pub(crate) enum Connection {
-    /// In this process.
-    Local(Arc<Device>),
+    /// In this process. Clients are dealt evenly over the devices.
+    Local(Vec<Arc<Device>>),
     /// Through shared memory.
     Shared(CallAddress, CancellationToken),
 }
@@ -47,11 +47,11 @@ impl ClientPool {
         Self { connection, idle: Mutex::default() }
     }
 
-    /// The device, if it is one of this process.
-    pub fn device(&self) -> Option<&Arc<Device>> {
+    /// The devices of this process.
+    pub fn devices(&self) -> &[Arc<Device>] {
         match &self.connection {
-            Connection::Local(device) => Some(device),
-            Connection::Shared(..) => None,
+            Connection::Local(devices) => devices,
+            Connection::Shared(..) => &[],
         }
     }
 
@@ -74,9 +74,10 @@ impl Client {
     fn connect(connection: &Connection) -> Result<Self, PotentialError> {
         static NEXT: AtomicU64 = AtomicU64::new(1);
         match connection {
-            Connection::Local(device) => {
+            Connection::Local(devices) => {
                 let number = NEXT.fetch_add(1, Ordering::Relaxed);
-                Ok(Self::Local { device: Arc::clone(device), number })
+                let device = Arc::clone(&devices[number as usize % devices.len()]);
+                Ok(Self::Local { device, number })
             }
             Connection::Shared(address, stopping) => {
                 let calls = CallClient::connect(address, stopping.clone());

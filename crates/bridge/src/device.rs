@@ -111,7 +111,7 @@ impl Device {
     /// # Errors
     /// An element that the model does not support, or an invalid structure.
     pub fn warm_up(&self, structure: &Structure, skin: f64, most: usize) -> Result<(), String> {
-        let description = &self.info.description;
+        let description = self.info.description();
         let index = |species: &Species| {
             let known = description.elements.iter().position(|symbol| symbol == species.symbol());
             known.ok_or_else(|| format!("the model does not support {species}"))

@@ -13,6 +13,8 @@ pub(crate) enum Fault {
     Nonsense(String),
     /// The device has too little memory for the batch.
     Memory(String),
+    /// Shared memory of this host has too little room for the batch.
+    Arena(String),
     /// The adapter reports an error of a call. The server goes on.
     Reported(String),
     /// The device was asked to stop.
@@ -27,6 +29,7 @@ impl Fault {
             | Self::Timeout(message)
             | Self::Nonsense(message)
             | Self::Memory(message)
+            | Self::Arena(message)
             | Self::Reported(message) => message,
             Self::Stopped => "the device was asked to stop",
         }

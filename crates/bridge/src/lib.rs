@@ -6,6 +6,7 @@
 
 mod arena;
 mod batch;
+mod batch_limit;
 mod call;
 mod client;
 mod description;
@@ -20,6 +21,7 @@ mod process;
 mod recipient;
 mod recovery;
 mod running;
+mod same_model;
 mod schedule;
 mod self_test;
 mod server;
@@ -35,6 +37,7 @@ pub use device::Device;
 pub use error::{CallError, DeviceError};
 pub use feature_map::RawProjection;
 pub use model::{PythonModel, PythonPotential};
+pub use same_model::ModelReference;
 pub use self_test::{SelfTestError, SelfTestReport};
 pub use service::DeviceService;
 pub use settings::PythonSettings;

@@ -30,13 +30,14 @@ impl fmt::Debug for PythonModel {
 }
 
 impl PythonModel {
-    /// The model of a device of this process.
+    /// The model of devices of this process. Evaluators take turns with them.
     ///
     /// # Errors
-    /// What is wrong with the description.
-    pub fn local(device: Arc<Device>) -> Result<Self, String> {
-        let description = device.info().description.clone();
-        Self::new(description, Connection::Local(device))
+    /// What is wrong with the description, or that there is no device.
+    pub fn local(devices: Vec<Arc<Device>>) -> Result<Self, String> {
+        let first = devices.first().ok_or("a model without a device")?;
+        let description = first.info().description().clone();
+        Self::new(description, Connection::Local(devices))
     }
 
     /// The model of a device of another process. Cancelling `stopping` ends calls that do not end.
@@ -80,9 +81,9 @@ impl PythonModel {
         })
     }
 
-    /// The device, if it is one of this process.
-    pub fn device(&self) -> Option<&Arc<Device>> {
-        self.clients.device()
+    /// The devices of this process.
+    pub fn devices(&self) -> &[Arc<Device>] {
+        self.clients.devices()
     }
 
     /// What the server said of it.

@@ -7,13 +7,12 @@ use tracing::warn;
 use crate::error::CallError;
 use crate::faults::Fault;
 use crate::running::{REFERENCE, Running, Suspect, Work};
+use crate::same_model::have_same_energies;
 use crate::schedule::{DeviceBatch, Kind, Ticket};
 use crate::server::Server;
 
 /// A server that fails so many times without an answer in between is given up.
 const MAX_FAILURES: u32 = 3;
-/// Largest relative difference of the reference structure's energies from those at the start.
-const REFERENCE_TOLERANCE: f64 = 1e-5;
 
 impl Running<'_> {
     /// Asks for a result once more, alone; if that has been tried, asks the reference structure.
@@ -34,10 +33,7 @@ impl Running<'_> {
     /// Compares the reference structure with what it was at the start. If it is the same, suspicious results are those of the model.
     pub fn judge(&mut self, energies: &[f64]) {
         let expected = &self.reference.1;
-        let size = expected.iter().map(|x| x.abs()).fold(1.0, f64::max);
-        let same = energies.len() == expected.len()
-            && energies.iter().zip(expected).all(|(a, b)| (a - b).abs() <= REFERENCE_TOLERANCE * size);
-        if !same {
+        if !have_same_energies(energies, expected) {
             let names = self.setup.settings.names();
             let sum = |energies: &[f64]| energies.iter().sum::<f64>();
             let message = format!(
@@ -65,20 +61,17 @@ impl Running<'_> {
     pub fn handle_fault(&mut self, fault: Fault, batch: DeviceBatch) {
         let tickets = batch.tickets();
         let bonds: usize = tickets.iter().map(|one| one.shape.bonds).sum();
+        let is_device = matches!(fault, Fault::Memory(_));
         match fault {
-            Fault::Memory(message) if tickets.len() > 1 => {
+            Fault::Memory(message) | Fault::Arena(message) if tickets.len() > 1 => {
                 warn!(
                     message,
                     structures = tickets.len(),
                     bonds,
                     "the device is short of memory: smaller batches"
                 );
-                self.schedule.limit_bonds(bonds / 2);
-                let limit = self.schedule.max_bonds() as u64;
-                self.setup.note(|statistics| {
-                    statistics.max_bonds = Some(limit);
-                    statistics.last_failure = Some(message);
-                });
+                self.limit_bonds(bonds / 2, is_device);
+                self.setup.note(|statistics| statistics.last_failure = Some(message));
                 self.schedule.put_back(tickets);
             }
             Fault::Reported(message) if tickets.iter().any(|one| one.id == REFERENCE) => {
@@ -96,6 +89,32 @@ impl Running<'_> {
                 self.restart(fault);
             }
         }
+    }
+
+    /// Limits the bonds of batches of several structures. What the memory of the device takes is kept for the next start.
+    pub fn limit_bonds(&mut self, bonds: usize, is_device: bool) {
+        self.schedule.limit_bonds(bonds);
+        let limit = self.schedule.max_bonds();
+        self.setup.note(|statistics| statistics.max_bonds = Some(limit as u64));
+        if let Some(file) = self.limit_file.as_ref().filter(|_| is_device)
+            && let Err(error) = file.write(limit)
+        {
+            warn!(%error, path = %file.path().display(), "cannot keep the size of batches for the next start");
+        }
+    }
+
+    /// Limits batches to the size that was found before, if there is one.
+    pub fn use_kept_limit(&mut self) {
+        let Some((file, bonds)) = self.limit_file.as_ref().and_then(|file| Some((file, file.read()?))) else {
+            return;
+        };
+        (self.progress)(&format!(
+            "batches of at most {bonds} bonds, which the memory of {} took before (kept in {})",
+            self.setup.settings.device,
+            file.path().display()
+        ));
+        self.schedule.limit_bonds(bonds);
+        self.setup.note(|statistics| statistics.max_bonds = Some(bonds as u64));
     }
 
     /// Ends the server and starts another one. Calls without results are sent again.

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use tracing::{info, warn};
 
+use crate::batch_limit::LimitFile;
 use crate::call::{BondGeometry, Call};
 use crate::description::AdapterFeatures;
 use crate::error::CallError;
@@ -57,6 +58,8 @@ pub(crate) struct Running<'a> {
     pub identity: String,
     pub reference: (BondGeometry, Vec<f64>),
     pub schedule: Schedule,
+    /// Keeps the size of batches for the next start.
+    pub limit_file: Option<LimitFile>,
     /// The last structure of each client.
     pub clients: HashMap<u64, BondGeometry>,
     pub calls: HashMap<u64, PendingCall>,
@@ -283,7 +286,13 @@ impl Running<'_> {
         let mut early = Vec::new();
         let mut fault = None;
         let mut copies = 1;
-        while copies <= most.min(self.schedule.max_structures()) {
+        let Shape { bonds, .. } = geometry.shape();
+        let fits = |copies: usize, schedule: &Schedule| {
+            copies <= most.min(schedule.max_structures())
+                && (copies == 1 || copies * bonds <= schedule.max_bonds())
+        };
+        let mut found = None;
+        while fits(copies, &self.schedule) {
             (self.progress)(&format!("preparing batches of {copies}"));
             let structures = vec![geometry; copies];
             let mut calls = Synchronous { server, setup: self.setup, early: &mut early, fault: None };
@@ -293,10 +302,12 @@ impl Running<'_> {
             });
             match made {
                 Ok(()) => copies *= 2,
-                Err(Fault::Memory(message)) if copies > 1 => {
-                    let Shape { bonds, .. } = geometry.shape();
-                    info!(message, copies, "the memory of the device takes fewer structures");
-                    self.schedule.limit_bonds(bonds * copies / 2);
+                Err(short @ (Fault::Memory(_) | Fault::Arena(_))) if copies > 1 => {
+                    info!(
+                        message = short.message(),
+                        copies, "the memory of the device takes fewer structures"
+                    );
+                    found = Some((bonds * copies / 2, matches!(short, Fault::Memory(_))));
                     break;
                 }
                 Err(other) => {
@@ -304,6 +315,9 @@ impl Running<'_> {
                     break;
                 }
             }
+        }
+        if let Some((bonds, is_device)) = found {
+            self.limit_bonds(bonds, is_device);
         }
         if let Some(fault) = fault {
             self.restart(fault);

@@ -113,7 +113,7 @@ impl Server {
         let (padding, cutoff) = (self.description.padding, self.description.cutoff());
         self.evaluations[slot] = None;
         let written = self.arenas[slot].write(structures, padding, cutoff);
-        written.map_err(|error| Fault::Memory(format!("shared memory for a batch: {error}")))
+        written.map_err(|error| Fault::Arena(format!("shared memory for a batch: {error}")))
     }
 
     /// Sends the batch of a slot.

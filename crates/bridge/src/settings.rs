@@ -56,6 +56,12 @@ impl PythonSettings {
         }
     }
 
+    /// The file of an adapter `file.py:Class`, and the class.
+    pub fn adapter_file(adapter: &str) -> Option<(&Path, &str)> {
+        let (file, class) = adapter.rsplit_once(':')?;
+        file.ends_with(".py").then_some((Path::new(file), class))
+    }
+
     /// The Python program. Behind a launcher, only that knows what the environment is.
     pub(crate) fn program(&self) -> PathBuf {
         let is_directory = self.launcher.is_empty() && self.environment.is_dir();
@@ -63,7 +69,7 @@ impl PythonSettings {
     }
 
     /// Names adapter and environment, for errors.
-    pub(crate) fn names(&self) -> String {
+    pub fn names(&self) -> String {
         format!("adapter {} in {}", self.adapter, self.environment.display())
     }
 }

@@ -6,10 +6,12 @@ use std::time::Instant;
 
 use tracing::info;
 
+use crate::batch_limit::LimitFile;
 use crate::description::{AdapterFeatures, ModelDescription};
 use crate::error::DeviceError;
 use crate::faults::Fault;
 use crate::running::{REFERENCE, Running};
+use crate::same_model::ModelReference;
 use crate::schedule::Schedule;
 use crate::self_test::{self, SelfTestReport, TestSubject};
 use crate::server::{Server, Synchronous};
@@ -18,10 +20,17 @@ use crate::setup::DeviceSetup;
 /// What a device tells of itself when it is ready.
 #[derive(Clone, Debug)]
 pub struct DeviceInfo {
-    /// The model.
-    pub description: ModelDescription,
+    /// The model, and what it gives for the test structure.
+    pub reference: ModelReference,
     /// The figures of the self-test.
     pub self_test: SelfTestReport,
+}
+
+impl DeviceInfo {
+    /// The model.
+    pub fn description(&self) -> &ModelDescription {
+        &self.reference.description
+    }
 }
 
 /// Starts the server, tells whether that went well, and works until the device is closed.
@@ -74,14 +83,16 @@ fn begin<'a>(
     let found = calls.round_trip(&[&reference], None).map_err(start_error)?;
     let energies = found.into_iter().next().map(|one| one.energies).unwrap_or_default();
     let limit = description.max_structures.unwrap_or(u32::MAX).min(setup.settings.max_batch.get());
-    let running = Running {
+    let limit_file = LimitFile::new(&setup.settings, &description);
+    let mut running = Running {
         setup,
         progress,
         server: Some(server),
         generation: 0,
         identity: description.identity.clone(),
-        reference: (reference, energies),
+        reference: (reference, energies.clone()),
         schedule: Schedule::new(limit as usize),
+        limit_file,
         clients: HashMap::new(),
         calls: HashMap::new(),
         sent: VecDeque::new(),
@@ -93,7 +104,8 @@ fn begin<'a>(
         started: Instant::now(),
         given_up: None,
     };
-    Ok((running, DeviceInfo { description, self_test: report }))
+    running.use_kept_limit();
+    Ok((running, DeviceInfo { reference: ModelReference { description, energies }, self_test: report }))
 }
 
 fn start_error(fault: Fault) -> DeviceError {

@@ -52,7 +52,7 @@ impl Fixture {
 
     /// Its model, with projected features.
     pub fn model(device: &Arc<Device>) -> Arc<PythonModel> {
-        let model = PythonModel::local(Arc::clone(device)).unwrap();
+        let model = PythonModel::local(vec![Arc::clone(device)]).unwrap();
         Arc::new(model.projected(random_projection(1, 8, 5, 2)).unwrap())
     }
 

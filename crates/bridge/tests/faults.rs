@@ -1,11 +1,14 @@
 //! Servers that fail.
 
+use std::sync::mpsc;
 use std::time::Duration;
 
 use atoms::{Evaluation, NeighbourList, PotentialError};
+use bridge::Device;
 use potentials::ModelWithFeatures;
 use potentials::grace::Threads;
 use serde_json::json;
+use tokio_util::sync::CancellationToken;
 
 use crate::common::{Fixture, crystal};
 use crate::results::biased_step;
@@ -50,6 +53,39 @@ fn batches_fit_into_the_memory() {
     });
     let statistics = device.statistics();
     assert!(statistics.max_bonds.is_some() && statistics.restarts == 0, "{statistics:?}");
+}
+
+/// The size that the memory takes is found once: the next start keeps to it, until more is wanted or the file is gone.
+#[test]
+fn the_size_of_batches_is_kept_for_the_next_start() {
+    let mut fixture = Fixture::new(json!({ "memory_above": 5, "padding": true }));
+    let (cache, count) = (fixture.directory.path().join("cache"), fixture.directory.path().join("count"));
+    fixture.settings.options.insert("count".to_owned(), json!(count));
+    fixture.settings.cache = Some(cache.clone());
+    // The largest batch of a start, the size that holds afterwards, and what is said of that.
+    let start = |fixture: &Fixture| {
+        let (sender, said) = mpsc::channel();
+        let progress = move |text: &str| drop(sender.send(text.to_owned()));
+        let device = Device::start(fixture.settings.clone(), &CancellationToken::new(), progress).unwrap();
+        let _ = std::fs::remove_file(&count);
+        device.warm_up(&crystal(1, 0), 0.5, 32).unwrap();
+        let calls = std::fs::read_to_string(&count).unwrap();
+        let structures = |line: &str| line.split(' ').next_back().unwrap().parse::<u32>().unwrap();
+        let kept: Vec<_> = said.try_iter().filter(|text| text.contains("took before")).collect();
+        (calls.lines().map(structures).max().unwrap(), device.statistics().max_bonds, kept)
+    };
+    let (largest, found, said) = start(&fixture);
+    assert!(largest == 8 && found.is_some() && said.is_empty(), "{largest} {found:?} {said:?}");
+    let (largest, kept, said) = start(&fixture);
+    assert_eq!((largest, kept, said.len()), (4, found, 1), "{said:?}");
+    assert!(said[0].contains(&format!("at most {} bonds", found.unwrap())), "{said:?}");
+    fixture.settings.max_batch = 64.try_into().unwrap();
+    assert_eq!(start(&fixture).0, 8, "larger batches are wanted");
+    assert_eq!(start(&fixture).0, 4);
+    std::fs::remove_dir_all(&cache).unwrap();
+    assert_eq!(start(&fixture).0, 8, "the file is gone");
+    fixture.settings.max_batch = 2.try_into().unwrap();
+    assert_eq!(start(&fixture).0, 2, "the configuration remains the limit");
 }
 
 /// A server that always fails is given up with the reason.

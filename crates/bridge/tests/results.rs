@@ -92,7 +92,7 @@ fn shared_memory_changes_nothing() {
     let service = DeviceService::open(&device, &place, 7, 4, 64).unwrap();
     let address = service.address().clone();
     let model =
-        PythonModel::shared(device.info().description.clone(), address, CancellationToken::new()).unwrap();
+        PythonModel::shared(device.info().description().clone(), address, CancellationToken::new()).unwrap();
     let model = Arc::new(model.projected(random_projection(1, 8, 5, 2)).unwrap());
     std::thread::scope(|scope| {
         for k in 0..4 {

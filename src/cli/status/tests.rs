@@ -67,7 +67,7 @@ pub fn large() -> Snapshot {
             Path::new("/scratch"),
         )),
         status: status(),
-        device: Some(DeviceStatistics {
+        devices: vec![DeviceStatistics {
             adapter: "gracemaker".into(),
             device: "cuda:1".into(),
             last_failure: Some(
@@ -75,7 +75,7 @@ pub fn large() -> Snapshot {
             ),
             restarts: 3,
             ..DeviceStatistics::default()
-        }),
+        }],
         mixture: MixtureValues(values.map(|(name, value)| (name.to_owned(), value.to_string())).into()),
         disk: DiskUse {
             bytes: 123_456_789_012,

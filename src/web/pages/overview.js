@@ -75,8 +75,9 @@ function summary(status) {
     (inForce || status.refit) && tile("Potential", `version ${whole(inForce?.number ?? 0)}`,
       inForce?.number > 0 && `trained on ${whole(inForce.labels)} labels`,
       status.refit && `training version ${whole(status.refit.number)}: ${status.refit.remark || words(status.refit.state)}`),
-    status.device && tile("Device", `${percent(status.device.busy_share)} busy`,
+    status.device && tile(status.devices.length > 1 ? "Devices" : "Device", `${percent(status.device.busy_share)} busy`,
       `${status.device.adapter} on ${status.device.device}`,
+      ...(status.devices.length > 1 ? status.devices.map(oneDevice) : []),
       `${digits(status.device.mean_batch)} structures a batch, largest ${whole(status.device.largest_batch)}`,
       `${digits(status.device.bonds_per_second)} bonds/s; calls wait ${digits(1000 * status.device.mean_wait)} ms`,
       status.device.compiled > 0 && `${digits(status.device.compiled)} s for batches of new sizes`,
@@ -87,6 +88,11 @@ function summary(status) {
       training?.alarm ? element("span", { class: "wrong" }, `forgetting: above ${exceeded(training)}`) : "",
       staleness ? `walkers had the newest version in ${percent(staleness.share_of_newest)} of decisions` : ""),
   ].filter(Boolean);
+}
+
+/** One of several devices, in a line. */
+function oneDevice({ device, busy_share, mean_batch, bonds_per_second }) {
+  return `${device}: ${percent(busy_share)} busy, ${digits(mean_batch)} structures a batch, ${digits(bonds_per_second)} bonds/s`;
 }
 
 /** The elements that are forgotten most: by the share of their sampled atoms above 1, and without a sample by the growth of σ². */

@@ -1,0 +1,180 @@
+//! The model of an agent: its files on this host, and the device of a model in Python, which must be the orchestrator's.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use bridge::{Device, DeviceError, PythonSettings};
+use tokio::task::spawn_blocking;
+use tokio_util::sync::CancellationToken;
+use wire::net::{LinkError, Membership};
+
+use crate::exit_status::CommandError;
+use crate::file_hash::verify_hash;
+use crate::output::log_and_print;
+use crate::process_config::{AgentModel, AgentPythonModel, DeviceModel, HashedFile, ModelFiles, WalkerModel};
+use crate::python_model;
+
+/// What is another one on this host than on the orchestrator's.
+#[derive(Clone, Debug, Default)]
+pub struct HostPython {
+    /// Environment of the model's framework.
+    pub environment: Option<PathBuf>,
+    /// Devices that evaluate the model. Empty: those of the configuration.
+    pub devices: Vec<String>,
+}
+
+/// Downloads the files of the model that are not on this host. `None` if this agent lost its membership meanwhile.
+///
+/// # Errors
+/// A connection or a directory that cannot be used.
+pub async fn with_files(
+    joined: &Membership,
+    model: AgentModel,
+    directory: &Path,
+) -> Result<Option<AgentModel>, CommandError> {
+    let mut model = model;
+    let files: Vec<(&mut HashedFile, PathBuf)> = match &mut model {
+        AgentModel::Grace(ModelFiles { export, artifact, .. }) => {
+            let artifact = artifact.iter_mut().map(|file| (file, directory.join("gmm_artifacts.npz")));
+            [(export, directory.join("kokkos.npz"))].into_iter().chain(artifact).collect()
+        }
+        AgentModel::Python(python) => {
+            let AgentPythonModel { model, adapter, artifact, .. } = &mut **python;
+            let places = [(model, "model"), (adapter, "adapter"), (artifact, "artifact")];
+            let known = places.into_iter().filter_map(|(file, place)| Some((file.as_mut()?, place)));
+            // Programs look at the names of files.
+            known
+                .map(|(file, place)| {
+                    let copy = directory.join(place).join(file.path.file_name().unwrap_or_default());
+                    (file, copy)
+                })
+                .collect()
+        }
+    };
+    for (file, copy) in files {
+        if !has_file(joined, file, copy).await? {
+            return Ok(None);
+        }
+    }
+    if let AgentModel::Python(python) = &mut model {
+        python.use_files();
+    }
+    Ok(Some(model))
+}
+
+/// Makes sure that a file of the orchestrator is on this host: as it is, or as a copy, which is downloaded. Returns whether this agent
+/// is still a member.
+async fn has_file(joined: &Membership, file: &mut HashedFile, copy: PathBuf) -> Result<bool, CommandError> {
+    if verify_hash(&file.path, &file.hash).is_ok() {
+        return Ok(true);
+    }
+    log_and_print(format_args!(
+        "{} of the orchestrator is not on this host: downloading the model …",
+        file.path.display()
+    ));
+    let bytes = match joined.fetch_file(&file.hash).await {
+        Err(LinkError::RejoinRequired(_)) => return Ok(false),
+        bytes => bytes.map_err(CommandError::failed)?,
+    };
+    let written = copy.parent().map_or(Ok(()), fs::create_dir_all).and_then(|()| fs::write(&copy, bytes));
+    written.map_err(|error| CommandError::Failed(format!("cannot write {}: {error}", copy.display())))?;
+    verify_hash(&copy, &file.hash).map_err(CommandError::failed)?;
+    file.path = copy;
+    Ok(true)
+}
+
+impl AgentPythonModel {
+    /// Has the program use the files of this host.
+    fn use_files(&mut self) {
+        for settings in &mut self.settings {
+            if let Some(model) = &self.model {
+                settings.model = Some(model.path.clone());
+            }
+            let class = PythonSettings::adapter_file(&settings.adapter).map(|(_, class)| class.to_owned());
+            if let (Some(adapter), Some(class)) = (&self.adapter, class) {
+                settings.adapter = format!("{}:{class}", adapter.path.display());
+            }
+        }
+    }
+
+    /// How the program of each device is started on this host.
+    fn settings_here(&self, here: &HostPython) -> Vec<PythonSettings> {
+        let on = |device: &String| {
+            let first = self.settings.first().cloned();
+            first.map(|settings| PythonSettings { device: device.clone(), ..settings })
+        };
+        let mut settings = match here.devices.as_slice() {
+            [] => self.settings.clone(),
+            devices => devices.iter().filter_map(on).collect(),
+        };
+        if let Some(environment) = &here.environment {
+            settings.iter_mut().for_each(|one| one.environment.clone_from(environment));
+        }
+        settings
+    }
+
+    /// Checks that the model of the devices of this host is the orchestrator's.
+    fn check(&self, devices: &[Arc<Device>], settings: &PythonSettings) -> Result<(), CommandError> {
+        let names = settings.names();
+        for device in devices {
+            self.reference.check(&device.info().reference, self.is_reproducible).map_err(|why| {
+                let model = settings.model.as_deref().unwrap_or(Path::new("its model")).display();
+                CommandError::Input(format!(
+                    "{names}: {model} is not the orchestrator's model on this host: {why}"
+                ))
+            })?;
+        }
+        match python_model::irreproducible(devices, settings.max_batch.get()) {
+            Some(why) if self.is_reproducible => {
+                Err(CommandError::Input(format!("{names}: the campaign is reproducible, but {why}")))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Starts the devices of a model in Python, if the model is one, and prepares them for the walkers. Cancelling `stop` ends that.
+///
+/// # Errors
+/// A program that does not start, or a model that is not the orchestrator's.
+pub async fn start_devices(
+    model: &AgentModel,
+    here: &HostPython,
+    skin: f64,
+    walkers: u32,
+    stop: &CancellationToken,
+) -> Result<Vec<Arc<Device>>, CommandError> {
+    let AgentModel::Python(python) = model else {
+        let given = here.environment.is_some() || !here.devices.is_empty();
+        let unused = "--python-environment and --device are for models in Python, but the campaign's is an export of GRACE";
+        return if given { Err(CommandError::input(unused)) } else { Ok(Vec::new()) };
+    };
+    let settings = python.settings_here(here);
+    let (starting, same_bits, stopping) = (settings.clone(), python.is_reproducible, stop.clone());
+    let devices = spawn_blocking(move || python_model::start(starting, same_bits, &stopping)).await;
+    let devices = match devices.map_err(CommandError::failed)? {
+        Err(DeviceError::Stopped) => return Ok(Vec::new()),
+        devices => devices.map_err(CommandError::input)?,
+    };
+    if let (Some(first), Some(device)) = (settings.first(), devices.first()) {
+        python.check(&devices, first)?;
+        let (adapter, names) = (&device.info().description().adapter, python_model::names(&devices));
+        log_and_print(format_args!("python: {adapter} on {names}: the orchestrator's model"));
+    }
+    python_model::warm_up(&devices, &python.largest, skin, walkers).await?;
+    Ok(devices)
+}
+
+impl AgentModel {
+    /// What walkers load the model from.
+    pub fn for_walkers(&self) -> WalkerModel {
+        match self {
+            Self::Grace(files) => WalkerModel::Grace(files.clone()),
+            Self::Python(python) => WalkerModel::Python(Box::new(DeviceModel {
+                description: python.reference.description.clone(),
+                artifact: python.artifact.clone(),
+            })),
+        }
+    }
+}
