@@ -18,6 +18,7 @@ mod cli_calm;
 mod cli_campaign;
 mod cli_md;
 mod configs;
+mod constant_pressure;
 mod dashboard;
 mod doctor;
 mod energies;
