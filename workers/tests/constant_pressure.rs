@@ -48,7 +48,7 @@ fn a_walk_starts_from_the_end_of_its_reference_run() {
     let reference = dense.structure.cell.volume() / 0.94;
     assert!((dilute.structure.cell.volume() / 1.06 / reference - 1.0).abs() < 1e-12, "the same V₀");
     assert!((reference / seed.cell.volume() - 1.0).abs() > 1e-4, "not that of the seed structure");
-    assert_eq!((dense.relative_volume - 0.94).abs() < 1e-12, true);
+    assert!((dense.relative_volume - 0.94).abs() < 1e-12);
     // The same run by itself.
     let content = wire::ContentHash::from_structure(&seed).0;
     let stream =
