@@ -160,7 +160,7 @@ mod tests {
     #[test]
     fn fluctuations_are_averaged() {
         let mut bias = CellBias::new(&paper(), 0.5);
-        let noise = |step: u64| if step % 2 == 0 { 0.05 } else { -0.05 };
+        let noise = |step: u64| if step.is_multiple_of(2) { 0.05 } else { -0.05 };
         (0..paper().window).for_each(|step| bias.observe(&paper(), 1.0 + noise(step)));
         assert_eq!(bias.gain(), 0.02 * 1.3);
     }
