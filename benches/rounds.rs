@@ -193,6 +193,7 @@ fn walk_settings() -> WalkSettings {
         barostat: BarostatSettings::default(),
         reference_steps: 0,
         cell_bias: CellBiasSettings::default(),
+        remove_update_work: false,
         trace_interval: 50,
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nmin_atoms = 3")
@@ -202,6 +203,7 @@ fn walk_settings() -> WalkSettings {
         zbl: Some(ZblWindows::Uniform(ZblWindow { inner: 1.6, outer: 2.4 })),
         guard: GuardSettings {
             min_distances: MinDistanceRule::default(),
+            max_grade: None,
             max_temperature: 20_000.0,
             rollback: true,
             max_consecutive_rejections: 10,

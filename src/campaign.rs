@@ -310,6 +310,7 @@ impl LoadedCampaign {
             reference_steps: walk.reference_steps,
             cell_bias: walk.cell_bias.unwrap_or_default().settings(),
             trace_interval: walk.trace_interval,
+            remove_update_work: walk.remove_update_work,
             skin: walk.skin.get(),
             collection: collect.criterion,
             min_interval: collect.min_interval,
@@ -317,6 +318,7 @@ impl LoadedCampaign {
             zbl: guard.zbl.clone(),
             guard: GuardSettings {
                 min_distances: guard.min_distances.clone(),
+                max_grade: guard.max_grade.map(|grade| grade.get()),
                 max_temperature: guard.max_temperature.get(),
                 rollback: guard.rollback,
                 max_consecutive_rejections: guard.max_consecutive_rejections.get(),

@@ -98,7 +98,8 @@ fn comment_of(text: &str, section: &str, key: &str) -> String {
 #[test]
 fn keys_that_are_commented_out_show_their_defaults() {
     for name in CAMPAIGNS {
-        let text = campaign(name);
+        // A barostat is an alternative to the ramp.
+        let text = campaign(name).replace("\nvolume_ramp = ", "\n# ramp: ");
         let (mut differ, before_all) = (Vec::new(), resolved(&text));
         // Reproducible mode refuses these keys.
         let others = ["after_time", "min_completion_probability"].iter().fold(text.clone(), |text, key| {
@@ -225,7 +226,7 @@ fn the_reference_has_every_range() {
             let [[least, most], [from, to]] =
                 [possible, usual].map(|bounds| bounds.map(|bound| range.shown(bound)));
             let possible =
-                if possible[0] > 0.0 { format!("{least} to {most}") } else { format!("at most {most}") };
+                if possible[0] != 0.0 { format!("{least} to {most}") } else { format!("at most {most}") };
             format!("| `{key}` | {unit} | {possible} | {from} to {to} |").replace("|  |", "| |")
         })
         .collect();

@@ -155,6 +155,9 @@ pub struct WalkSection {
     /// Bias on the cell of walks with a barostat. Default: none.
     #[serde(default)]
     pub cell_bias: Option<CellBiasSection>,
+    /// Whether the energy that an update of the mixture gives to a biased walk is taken out of its kinetic energy again.
+    #[serde(default)]
+    pub remove_update_work: bool,
     /// Number of steps over which the norms in τ_r are averaged.
     #[serde(default = "defaults::bias_averaging_steps")]
     pub bias_averaging_steps: NonZeroU64,
@@ -305,6 +308,8 @@ pub struct GuardSection {
     pub min_distances: MinDistanceRule,
     /// Switched ZBL repulsion at short range. Default: none.
     pub zbl: Option<ZblWindows>,
+    /// Largest γ_max of a structure that is collected. Default: no limit.
+    pub max_grade: Option<Positive>,
     /// Highest allowed kinetic temperature, K.
     pub max_temperature: Positive,
     /// Whether a walk rolls back to a checkpoint when the guard rejects one configuration after the other. If not, it
@@ -590,6 +595,7 @@ impl Default for GuardSection {
         Self {
             min_distances: MinDistanceRule::default(),
             zbl: None,
+            max_grade: None,
             max_temperature: defaults::positive(20_000.0),
             rollback: true,
             max_consecutive_rejections: defaults::nonzero(10),

@@ -74,6 +74,7 @@ mod tests {
     fn reasons_of_the_guard_have_causes() {
         let settings = GuardSettings {
             min_distances: MinDistanceRule::default(),
+            max_grade: None,
             max_temperature: 1000.0,
             rollback: true,
             max_consecutive_rejections: 10,

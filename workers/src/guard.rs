@@ -6,6 +6,8 @@ use crate::settings::GuardSettings;
 
 /// Name of the guard against atoms that are too close.
 pub const SHORTEST_BOND: &str = "shortest-bond";
+/// Name of the guard against grades that no label is wanted for.
+pub const LARGEST_GRADE: &str = "largest-grade";
 
 /// The reason to end a walk, if there is one: forces that are not finite, a temperature (K) above the limit, or an
 /// atom without neighbours within the cutoff.

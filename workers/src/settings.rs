@@ -31,6 +31,8 @@ pub struct WalkSettings {
     pub cell_bias: CellBiasSettings,
     /// Steps between two points of the trace; 0: none.
     pub trace_interval: u64,
+    /// Whether the energy that an update of the mixture gives to a biased walk is taken out of its kinetic energy.
+    pub remove_update_work: bool,
     /// Neighbour-list skin, Å.
     pub skin: f64,
     /// When a structure becomes a candidate.
@@ -50,6 +52,8 @@ pub struct WalkSettings {
 pub struct GuardSettings {
     /// How close atoms may come.
     pub min_distances: MinDistanceRule,
+    /// γ_max above which a structure is rejected; `None` for no bound.
+    pub max_grade: Option<f64>,
     /// Temperature above which a walk ends, K.
     pub max_temperature: f64,
     /// Whether a walk rolls back to a checkpoint after rejections; if not, it goes on.

@@ -8,6 +8,7 @@ mod constant_pressure;
 mod error;
 mod state;
 mod trace;
+mod update_work;
 
 use std::sync::Arc;
 
@@ -137,6 +138,7 @@ impl<'a> RunningWalk<'a> {
             trace: Vec::new(),
         };
         walk.apply_verdict();
+        walk.remove_update_work()?;
         if assignment.checkpoint.is_none() {
             walk.trace_if_due()?;
         }
@@ -211,6 +213,7 @@ impl<'a> RunningWalk<'a> {
         if equilibrated {
             self.observe_cell(reflections);
         }
+        self.state.bias_sum = self.bias_sum();
         self.check_step()
     }
 
@@ -246,14 +249,17 @@ impl<'a> RunningWalk<'a> {
         let gamma = gamma(&mut self.potential, &self.dynamics)?;
         self.state.gamma_max = calm::grade::maximum(gamma);
         let collects = step >= self.state.next_offer && self.collection.is_met(gamma);
-        match (collects, too_close) {
-            (false, _) => Ok(None),
-            (true, true) => self.record_refusal(),
-            (true, false) => {
-                self.state.max_consecutive_rejections = 0;
-                Ok(Some(Outcome::Candidate(self.candidate()?)))
-            }
+        if !collects {
+            return Ok(None);
         }
+        if too_close {
+            return self.record_refusal(guard::SHORTEST_BOND);
+        }
+        if self.settings.guard.max_grade.is_some_and(|bound| self.state.gamma_max > bound) {
+            return self.record_refusal(guard::LARGEST_GRADE);
+        }
+        self.state.max_consecutive_rejections = 0;
+        Ok(Some(Outcome::Candidate(self.candidate()?)))
     }
 
     fn is_too_close(&self) -> bool {
@@ -266,8 +272,8 @@ impl<'a> RunningWalk<'a> {
         self.state.keep_checkpoint(&self.dynamics, &self.potential);
     }
 
-    /// Counts a refusal by the shortest-bond guard. After too many in a row the walk rolls back, or ends.
-    fn record_refusal(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
+    /// Counts a refusal by a guard. After too many in a row the walk rolls back, or ends.
+    fn record_refusal(&mut self, by: &str) -> Result<Option<Outcome<Candidate>>, WalkError> {
         let guard = &self.settings.guard;
         self.state.rejected += 1;
         self.state.max_consecutive_rejections += 1;
@@ -276,7 +282,7 @@ impl<'a> RunningWalk<'a> {
             return Ok(None);
         }
         if self.state.rollbacks == guard.max_rollbacks || self.state.good.is_empty() {
-            return Ok(Some(Outcome::Ended(WalkEnd::Trapped { guard: guard::SHORTEST_BOND.to_owned() })));
+            return Ok(Some(Outcome::Ended(WalkEnd::Trapped { guard: by.to_owned() })));
         }
         self.roll_back()?;
         Ok(None)
@@ -296,6 +302,7 @@ impl<'a> RunningWalk<'a> {
         self.dynamics = Dynamics::resume(checkpoint, cutoff, self.settings.skin)?;
         self.potential.state = bias;
         self.state.cell_bias = cell_bias;
+        self.state.bias_sum = None;
         self.state.next_offer = self.state.offer_after_rollback(self.step(), self.settings);
         self.save_checkpoint();
         Ok(())

@@ -10,4 +10,5 @@ mod constant_pressure;
 mod deep_models;
 mod labeller;
 mod trace;
+mod update_work;
 mod walk;

@@ -52,6 +52,7 @@ pub fn settings() -> WalkSettings {
         barostat: BarostatSettings::default(),
         reference_steps: 0,
         cell_bias: CellBiasSettings::default(),
+        remove_update_work: false,
         trace_interval: 50,
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'").unwrap(),
@@ -60,6 +61,7 @@ pub fn settings() -> WalkSettings {
         zbl: uniform_zbl(1.6, 2.4),
         guard: GuardSettings {
             min_distances: MinDistanceRule::Uniform(Uniform::default()),
+            max_grade: None,
             max_temperature: 20_000.0,
             rollback: true,
             max_consecutive_rejections: 5,

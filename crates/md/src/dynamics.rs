@@ -136,6 +136,13 @@ impl Dynamics {
         self.now.validate()
     }
 
+    /// Multiplies all velocities by a factor.
+    pub fn scale_velocities(&mut self, factor: f64) {
+        for velocity in &mut self.now.state.velocities {
+            *velocity = scale(*velocity, factor);
+        }
+    }
+
     /// The state from which the run can resume.
     pub fn checkpoint(&self) -> &Checkpoint {
         &self.now

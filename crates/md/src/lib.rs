@@ -40,7 +40,9 @@ pub use fire::{Fire, Relaxed};
 pub use langevin::{Langevin, LangevinSettings};
 pub use nose_hoover::{NoseHooverChain, NoseHooverSettings};
 pub use random::{Stream, StreamId, philox};
-pub use state::{State, kinetic_energy, kinetic_tensor, masses, maxwell_boltzmann, momentum, temperature};
+pub use state::{
+    State, kinetic_energy, kinetic_tensor, masses, maxwell_boltzmann, momentum, temperature, thermal_energy,
+};
 pub use thermostat::{Thermostat, ThermostatSettings};
 pub use velocity_rescaling::{VelocityRescaling, VelocityRescalingSettings};
 pub use volume_ramp::{VolumeRamp, extent, scale_volume};

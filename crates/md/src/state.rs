@@ -52,6 +52,11 @@ pub fn momentum(velocities: &[Vec3], masses: &[f64]) -> Vec3 {
     velocities.iter().zip(masses).fold([0.0; 3], |p, (v, m)| add(p, scale(*v, *m)))
 }
 
+/// ½ g k_B T, eV: the mean kinetic energy of g degrees of freedom.
+pub fn thermal_energy(temperature: f64, degrees_of_freedom: usize) -> f64 {
+    0.5 * degrees_of_freedom as f64 * BOLTZMANN * temperature
+}
+
 /// T = 2 K / (g k_B), K, for g degrees of freedom; 0 when there are none.
 pub fn temperature(kinetic_energy: f64, degrees_of_freedom: usize) -> f64 {
     if degrees_of_freedom == 0 {

@@ -125,7 +125,15 @@ fn status() -> CampaignStatus {
         relative_volume: Some(1.234),
         gamma_max: Some(123.45),
         steps_per_second: Some(1234.5),
-        conditions: Some(WalkConditions { volume_ramp: Some((1.0, 1.4)), ..WalkConditions::default() }),
+        conditions: Some(WalkConditions {
+            volume_ramp: Some((1.0, 1.4)),
+            constant_pressure: Some(wire::ConstantPressure {
+                pressure: 1.0,
+                start_volume: 1.0,
+                cell_bias: true,
+            }),
+            ..WalkConditions::default()
+        }),
         accepted: 300,
         ..WalkStatus::default()
     };

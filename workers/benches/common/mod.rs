@@ -80,6 +80,7 @@ fn settings(threshold: f64) -> WalkSettings {
         barostat: BarostatSettings::default(),
         reference_steps: 0,
         cell_bias: CellBiasSettings::default(),
+        remove_update_work: false,
         trace_interval: 50,
         skin: 0.5,
         collection: toml::from_str(&format!("rule = 'maximum_grade'\nthreshold = {threshold:e}"))
@@ -89,6 +90,7 @@ fn settings(threshold: f64) -> WalkSettings {
         zbl: Some(ZblWindows::Uniform(ZblWindow { inner: 1.6, outer: 2.4 })),
         guard: GuardSettings {
             min_distances: MinDistanceRule::Uniform(Uniform { min_distance: 1.2, fraction: 0.5 }),
+            max_grade: None,
             max_temperature: 20_000.0,
             rollback: true,
             max_consecutive_rejections: 10,

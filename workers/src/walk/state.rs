@@ -26,6 +26,8 @@ pub(super) struct WalkState {
     pub reference_volume: f64,
     /// Of a walk with a biased cell.
     pub cell_bias: Option<CellBias>,
+    /// Where the bias acts: version of the mixture, and Σγ under it.
+    pub bias_sum: Option<(u64, f64)>,
     pub tau: f64,
     pub segment: u32,
     pub rollbacks: u32,
@@ -115,6 +117,7 @@ pub(super) fn start(
         reference_run,
         reference_volume,
         cell_bias,
+        bias_sum: None,
         tau: if assignment.origin == Origin::Control { 0.0 } else { conditions.tau },
         segment: 0,
         rollbacks: 0,

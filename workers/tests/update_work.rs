@@ -1,0 +1,108 @@
+//! The energy that an update of the mixture gives to a biased walk, and structures beyond the largest grade.
+
+use std::sync::Arc;
+
+use atoms::units::BOLTZMANN;
+use calm::{Batch, CovarianceUpdate, Mixture};
+use potentials::grace::Threads;
+use wire::Candidate;
+use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd};
+use workers::settings::{GuardSettings, WalkSettings};
+use workers::walk::{WalkContext, advance};
+
+use crate::walk::{assignment, mixture, model, run, seed_structure, settings, whole_walk};
+
+/// Collects every 40 steps from the first biased one on.
+fn eager() -> WalkSettings {
+    let collection = toml::from_str("rule = 'maximum_grade'\nthreshold = 1e-9").unwrap();
+    WalkSettings { collection, min_interval: 40, trace_interval: 1, remove_update_work: true, ..settings() }
+}
+
+fn under(settings: &WalkSettings, mixture: Arc<Mixture>, next: &Assignment) -> AssignmentReport<Candidate> {
+    let context =
+        WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings.clone()) };
+    advance(&context, next, mixture, || false, |_| {}).unwrap()
+}
+
+#[test]
+fn the_work_of_an_update_is_taken_out_of_the_kinetic_energy() {
+    let (settings, before) = (eager(), mixture());
+    let mut next = assignment(seed_structure("vacancy"), 500);
+    let first = run(&settings, &next);
+    assert_eq!(first.progress.step, 21);
+    (next.checkpoint, next.verdict) = (Some(first.checkpoint), Some(Verdict::Accepted));
+    let second = run(&settings, &next);
+    let Outcome::Candidate(candidate) = &second.outcome else { panic!("{:?}", second.outcome) };
+    assert_eq!(second.progress.step, 61);
+    next.checkpoint = Some(second.checkpoint);
+    next.last_step = 61;
+
+    let elements = model().element_indices(&candidate.structure.species).unwrap();
+    let batch = Batch::new(&before, &elements, &candidate.features).unwrap();
+    let temperature = |settings: &WalkSettings, mixture: &Arc<Mixture>| {
+        under(settings, Arc::clone(mixture), &next).progress.temperature
+    };
+    assert_eq!(temperature(&settings, &before), second.progress.temperature, "without an update");
+    for alpha in [0.002, 1.0] {
+        let changed = batch.updated(CovarianceUpdate::Convex { alpha }).unwrap();
+        let after = Arc::new(before.with_changes(&changed).unwrap());
+        let sum = |gamma: &[f64]| gamma.iter().sum::<f64>();
+        let lowered = sum(&candidate.gamma) - sum(&batch.gamma_under(&changed));
+        let work = second.trace.last().unwrap().bias_scale * lowered;
+        assert!(work > 0.0);
+        let degrees = 3.0 * candidate.structure.len() as f64;
+        let expected = second.progress.temperature - 2.0 * work / (degrees * BOLTZMANN);
+        let found = temperature(&settings, &after);
+        let expected = expected.max(0.5 * 600.0);
+        assert!((found - expected).abs() < 1e-8 * expected, "α {alpha}: {found} K, expected {expected} K");
+        let as_in_the_paper = WalkSettings { remove_update_work: false, ..settings.clone() };
+        assert_eq!(temperature(&as_in_the_paper, &after), second.progress.temperature);
+    }
+}
+
+/// The work is taken out once, however the walk is interrupted.
+#[test]
+fn an_interruption_after_an_update_changes_nothing() {
+    let (settings, before) = (eager(), mixture());
+    let mut next = assignment(seed_structure("vacancy"), 500);
+    for _ in 0..2 {
+        let report = run(&settings, &next);
+        (next.checkpoint, next.verdict) = (Some(report.checkpoint), Some(Verdict::Accepted));
+    }
+    let after = Arc::new(before.at_version(before.version() + 1));
+    let changed = {
+        let report = run(&settings, &next);
+        let Outcome::Candidate(candidate) = report.outcome else { panic!("no candidate") };
+        let elements = model().element_indices(&candidate.structure.species).unwrap();
+        Batch::new(&before, &elements, &candidate.features)
+            .unwrap()
+            .updated(CovarianceUpdate::Convex { alpha: 0.1 })
+            .unwrap()
+    };
+    let after = Arc::new(after.with_changes(&changed).unwrap());
+    next.last_step = 80;
+    let whole = under(&settings, Arc::clone(&after), &next);
+    let (verdict, checkpoint) = (next.verdict.take(), next.checkpoint.clone());
+    next.verdict = verdict;
+    for last_step in [61, 61, 70, 80] {
+        next.last_step = last_step;
+        next.checkpoint = Some(under(&settings, Arc::clone(&after), &next).checkpoint);
+        // The verdict is that of the first assignment.
+        next.verdict = None;
+    }
+    assert_ne!(next.checkpoint, checkpoint);
+    assert_eq!(next.checkpoint, Some(whole.checkpoint));
+}
+
+#[test]
+fn structures_beyond_the_largest_grade_are_rejected() {
+    let guard = GuardSettings { max_grade: Some(1e-6), max_rollbacks: 0, ..settings().guard };
+    let reports = whole_walk(&WalkSettings { guard, ..eager() }, assignment(seed_structure("vacancy"), 150));
+    let last = reports.last().unwrap();
+    assert!(
+        matches!(&last.outcome, Outcome::Ended(WalkEnd::Trapped { guard }) if guard == "largest-grade"),
+        "{:?}",
+        last.outcome
+    );
+    assert_eq!(last.progress.rejected, 5);
+}
