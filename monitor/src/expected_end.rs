@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 use serde_json::Value;
-use store::{CampaignStatus, unix_milliseconds};
+use store::{CampaignStatus, WalkStatus, unix_milliseconds};
 
 use crate::label_cost::{QueueCost, SECONDS_PER_HOUR};
 
@@ -28,7 +28,13 @@ impl ExpectedEnd {
         let steps = |key: &str| configuration["walk"][key].as_u64().unwrap_or_default();
         let steps_per_walk = steps("equilibration_steps") + steps("biased_steps");
         let under_way = status.walks.iter().filter(|walk| walk.is_active());
-        let left: u64 = under_way.map(|walk| steps_per_walk.saturating_sub(walk.step)).sum();
+        // A walk at constant pressure counts no steps before the end of its reference run.
+        let reference = |walk: &WalkStatus| {
+            let constant = walk.conditions.as_ref().is_some_and(|walk| walk.constant_pressure.is_some());
+            if constant && walk.step == 0 { steps("reference_steps") } else { 0 }
+        };
+        let left = |walk: &WalkStatus| reference(walk) + steps_per_walk.saturating_sub(walk.step);
+        let left: u64 = under_way.map(left).sum();
         let speed = status.steps_per_second.filter(|speed| status.run_active && *speed > 0.0);
         let walks_hours = match left {
             0 => Some(0.0),
@@ -50,7 +56,7 @@ impl ExpectedEnd {
 #[cfg(test)]
 mod tests {
     use serde_json::json;
-    use store::{Budget, WalkStatus};
+    use store::Budget;
 
     use super::*;
 

@@ -20,6 +20,10 @@ pub enum EarlyEndCause {
     Crashed,
     /// The shortest-bond guard rejected its structures repeatedly.
     Trapped,
+    /// Its structures were repeatedly above `guard.max_grade`.
+    BeyondGrade,
+    /// A cell with a barostat changed too fast or too far.
+    UnstableCell,
     /// No walk can start from the seed structure.
     InvalidStart,
     /// Any other cause.
@@ -55,10 +59,12 @@ pub fn early_end_cause(state: &str, reason: &str) -> Option<EarlyEndCause> {
     match state {
         "waiting" | "running" | "completed" | "quota_reached" | "budget" | "superseded" | "nothing_new"
         | "volume_boundary" => None,
+        "trapped" if has("largest-grade") => Some(EarlyEndCause::BeyondGrade),
         "trapped" => Some(EarlyEndCause::Trapped),
         _ if has("walkers crashed") || has("walker crashed") => Some(EarlyEndCause::Crashed),
         "invalid_start" => Some(EarlyEndCause::InvalidStart),
         _ if has("is above the allowed") => Some(EarlyEndCause::TooHot),
+        _ if has("the cell changes by") || has("the volume is") => Some(EarlyEndCause::UnstableCell),
         _ if has("not finite") => Some(EarlyEndCause::NotFinite),
         _ if has("has no neighbour") => Some(EarlyEndCause::LostAtom),
         _ => Some(EarlyEndCause::Other),
@@ -81,6 +87,11 @@ impl EarlyEndCause {
                 "nothing in the configuration: check the walkers' last output in the log, and the free memory"
             }
             Self::Trapped => "a smaller walk.tau, or guard.zbl; guard.min_distances says what is too close",
+            Self::BeyondGrade => "a larger guard.max_grade, or a smaller walk.tau",
+            Self::UnstableCell => {
+                "walk.barostat.pressure, a longer walk.barostat.relaxation_time, smaller gains in walk.cell_bias.gain_range, or a \
+                 walk.start_volume closer to 1"
+            }
             Self::InvalidStart => "the seed structure: the reason says what is wrong with it",
             Self::Other => "a smaller walk.time_step or walk.tau, or guard.zbl",
         }

@@ -232,6 +232,11 @@ impl Loader<'_> {
                  cell (Lattice=… in its comment line), or leave {key} out"
             ));
         }
+        let WalkSection { barostat, temperature, thermostat, .. } = &self.config.walk;
+        let barostat = barostat.as_ref().filter(|_| self.config.walks.is_empty());
+        if let Some(fault) = barostat.and_then(|of| of.fault(temperature.get(), thermostat, structure)) {
+            return Err(format!("walk.barostat: {fault}"));
+        }
         Ok(())
     }
 

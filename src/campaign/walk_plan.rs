@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use atoms::Structure;
 use calm::rules::Positive;
+use md::BarostatSettings;
 use orchestrator::selector::SeedStructurePlan;
 use wire::{ConstantPressure, WalkConditions};
 
@@ -16,6 +17,9 @@ use crate::filter::{StructureFilter, StructureProperties};
 
 /// Largest number of biased walks.
 const MAX_WALKS: usize = 1_000_000;
+
+/// What else can be done about a structure without a volume.
+const CONSTANT_VOLUME: &str = ", or give the group volume_ramps = [{ from = 1.0, to = 1.0 }]";
 
 /// Properties of seed structures that a filter may name.
 const PROPERTIES: [&str; 3] = ["atoms", "element", "seed_structure"];
@@ -91,12 +95,13 @@ impl Loader<'_> {
                 continue;
             }
             selected = true;
-            let (name, has_volume) = (&plan.name, plan.structure.periodic != [false; 3]);
-            if !has_volume && conditions.iter().any(WalkConditions::changes_volume) {
+            let (name, structure) = (&plan.name, &plan.structure);
+            let fault = |conditions: &WalkConditions| cell_fault(&self.config.walk, conditions, structure);
+            if let Some(fault) = conditions.iter().find_map(fault) {
                 let reason = format!(
-                    "group '{}' changes the volume, but the structure has no periodic direction; leave it out \
-                     (seed_structures = \"seed_structure != '{name}'\"), or give the group volume_ramps = [{{ from = 1.0, to = 1.0 }}]",
-                    group.name
+                    "group '{}' {fault}; leave it out (seed_structures = \"seed_structure != '{name}'\"){}",
+                    group.name,
+                    if group.pressures.is_empty() { CONSTANT_VOLUME } else { "" }
                 );
                 if self.config.seed_structures.on_invalid == OnInvalid::Error {
                     let message = format!("seed structure '{name}' ({source}): {reason}");
@@ -104,9 +109,8 @@ impl Loader<'_> {
                 }
                 without_volume.entry(name.clone()).or_insert(reason);
             }
-            let possible = |conditions: &&WalkConditions| has_volume || !conditions.changes_volume();
             let before = plan.walks.len();
-            plan.walks.extend(conditions.iter().filter(possible).cloned());
+            plan.walks.extend(conditions.iter().filter(|conditions| fault(conditions).is_none()).cloned());
             walks += plan.walks.len() - before;
         }
         match &group.seed_structures {
@@ -172,6 +176,17 @@ fn combinations(walk: &WalkSection, group: &WalkGroupSection) -> Vec<WalkConditi
         }
     }
     walks
+}
+
+/// Why the cell of a structure cannot do what these conditions ask, if it cannot.
+fn cell_fault(walk: &WalkSection, conditions: &WalkConditions, structure: &Structure) -> Option<String> {
+    if structure.periodic == [false; 3] && conditions.changes_volume() {
+        return Some("changes the volume, but the structure has no periodic direction".to_owned());
+    }
+    let pressure = conditions.constant_pressure?.pressure;
+    let barostat = BarostatSettings { pressure, ..walk.barostat.unwrap_or_default() };
+    let fault = barostat.fault(conditions.temperature, &walk.thermostat, structure)?;
+    Some(format!("has a barostat: {fault}"))
 }
 
 /// A volume ramp, or a constant pressure, or neither.

@@ -36,6 +36,7 @@ pub fn check(config: &Config) -> Vec<InvalidValue> {
         check_groups(config),
         check_constant_pressure(config),
         check_temperature(config),
+        check_largest_grade(config),
         check_store(config),
         check_queue(config),
         check_completion(config),
@@ -310,6 +311,19 @@ fn check_groups(config: &Config) -> Result<(), InvalidValue> {
         }
     }
     Ok(())
+}
+
+fn check_largest_grade(config: &Config) -> Result<(), InvalidValue> {
+    let threshold = config.collect.criterion.threshold();
+    match config.guard.max_grade {
+        Some(bound) if bound.get() <= threshold => {
+            let expected = format!(
+                "more than the threshold of collect.criterion, {threshold}: otherwise nothing is collected"
+            );
+            wrong("guard.max_grade", bound.get(), expected)
+        }
+        _ => Ok(()),
+    }
 }
 
 fn check_temperature(config: &Config) -> Result<(), InvalidValue> {

@@ -85,7 +85,7 @@ pub static RANGES: [Range; 129] = [
     range("walk.barostat.pressure", "bar", [-1e7, 1e7], [-1e5, 1e6], BAR),
     range("walk.barostat.relaxation_time", "fs", [0.0, 1e6], [100.0, 1e4], FEMTOSECONDS),
     range("walk.reference_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
-    range("walk.start_volume", "V/V₀", [0.05, 20.0], [0.4, 3.0], RELATIVE_VOLUME),
+    range("walk.start_volume", "V/V₀", [0.25, 4.0], [0.4, 3.0], RELATIVE_VOLUME),
     range("walk.cell_bias.stress_scale", "GPa", [0.0, 1e5], [0.1, 1e3], "it is in GPa: 1 eV/Å³ is 160 GPa"),
     range("walk.cell_bias.gain", "", [0.0, 10.0], [1e-4, 0.5], GAIN),
     range("walk.cell_bias.window", "", [2.0, STEPS], [100.0, 1e5], ""),

@@ -60,15 +60,14 @@ pub async fn run(settings: &AgentSettings<'_>, state: &AgentState) -> Result<Exi
     let stop = CancellationToken::new();
     cancel_on_signal(stop.clone(), STOP_MESSAGE)?;
     loop {
-        let (ended, has_versions) = run_version(settings, state, &stop).await?;
-        if ended != ExitStatus::Done || !has_versions {
+        let (ended, goes_on) = run_version(settings, state, &stop).await?;
+        if ended != ExitStatus::Done || !goes_on {
             return Ok(ended);
         }
-        log_and_print("no more walks with this version of the potential: waiting for the next one");
     }
 }
 
-/// Works with one version of the potential. Returns whether there may be another one.
+/// Works with one version of the potential. Returns whether there may be another one, or the orchestrator has other settings.
 async fn run_version(
     settings: &AgentSettings<'_>,
     state: &AgentState,
@@ -123,13 +122,22 @@ async fn run_version(
     let removed = shm_dir.remove().map_err(CommandError::failed);
     let ended = ended?;
     removed?;
+    let HostEnd::Exit(ended) = ended else {
+        log_and_print("the orchestrator has other settings now: joining again");
+        return Ok((ExitStatus::Done, true));
+    };
     match device_watch::last_failure(&devices) {
         Some(failure) if ended != ExitStatus::Done && !stop.is_cancelled() => {
             Err(CommandError::Failed(format!(
                 "{failure}\nthe assignments of this host went back to the orchestrator: mend the cause and start the agent again"
             )))
         }
-        _ => Ok((ended, setup.has_versions)),
+        _ => {
+            if ended == ExitStatus::Done && setup.has_versions {
+                log_and_print("no more walks with this version of the potential: waiting for the next one");
+            }
+            Ok((ended, setup.has_versions))
+        }
     }
 }
 
@@ -169,6 +177,13 @@ struct AgentHost {
     failed: Option<String>,
 }
 
+/// How the work of a host with one setup ended.
+enum HostEnd {
+    Exit(ExitStatus),
+    /// The orchestrator came back with another one.
+    SetupChanged,
+}
+
 type DispatchTask = JoinHandle<Result<agent::AgentExit, LinkError>>;
 
 /// What an agent runs on its host.
@@ -187,7 +202,7 @@ impl HostPlan<'_> {
         shm_dir: &ShmDir,
         mixture: &Mixture,
         dispatch: impl FnOnce(mpsc::Receiver<Incoming>) -> DispatchTask,
-    ) -> Result<ExitStatus, CommandError> {
+    ) -> Result<HostEnd, CommandError> {
         let Self { setup, walkers, threads, devices, stop, state } = self;
         let sizes = HostSizes { walkers, message_bytes: setup.message_bytes, devices: devices.len() };
         let session = u64::from(std::process::id());
@@ -215,7 +230,7 @@ impl HostPlan<'_> {
 
 impl AgentHost {
     /// Runs until every walker has ended and every report is delivered.
-    async fn supervise(mut self, stop: &CancellationToken) -> Result<ExitStatus, CommandError> {
+    async fn supervise(mut self, stop: &CancellationToken) -> Result<HostEnd, CommandError> {
         let (mut dispatched, mut gone) = (None, false);
         let mut stop_requested = pin!(stop.cancelled().fuse());
         let mut ticks = interval(STATUS_INTERVAL);
@@ -237,10 +252,11 @@ impl AgentHost {
         }
         self.serving.await.map_err(CommandError::failed)?.map_err(CommandError::failed)?;
         match dispatched.transpose()? {
-            Some(agent::AgentExit::Done) => Ok(ExitStatus::Done),
+            Some(agent::AgentExit::Done) => Ok(HostEnd::Exit(ExitStatus::Done)),
+            Some(agent::AgentExit::SetupChanged) if !stop.is_cancelled() => Ok(HostEnd::SetupChanged),
             _ => match self.failed {
                 Some(how) => Err(CommandError::Failed(format!("no walker is left: {how}"))),
-                None => Ok(ExitStatus::Interrupted),
+                None => Ok(HostEnd::Exit(ExitStatus::Interrupted)),
             },
         }
     }

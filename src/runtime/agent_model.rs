@@ -155,6 +155,10 @@ pub async fn start_devices(
     let devices = spawn_blocking(move || python_model::start(starting, same_bits, &stopping)).await;
     let devices = match devices.map_err(CommandError::failed)? {
         Err(DeviceError::Stopped) => return Ok(Vec::new()),
+        // A busy device may be free at the next start.
+        Err(error @ (DeviceError::Server(_) | DeviceError::File { .. })) => {
+            return Err(CommandError::failed(error));
+        }
         devices => devices.map_err(CommandError::input)?,
     };
     if let (Some(first), Some(device)) = (settings.first(), devices.first()) {

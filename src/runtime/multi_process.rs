@@ -97,12 +97,13 @@ async fn run_in(
     let local = server.run(shared, to_reactor.clone(), manager.listener());
     let agents = AgentService::open(run, session(process), &mixture).await?;
     let no_more_work = CancellationToken::new();
-    let tokens = StopTokens { stopping: stopping.clone(), closing: no_more_work.clone() };
+    let walks = stopping.child_token();
+    // Agents stop too when walks cannot go on here: with a later run, they join again.
+    let tokens = StopTokens { stopping: walks.clone(), closing: no_more_work.clone() };
     let remote = agents.run(tokens, to_reactor);
     let serving = tokio::spawn(async {
         tokio::try_join!(async { local.await.map_err(CommandError::failed) }, remote).map(|_| ())
     });
-    let walks = stopping.child_token();
     let _watch = DeviceWatch::start(devices, Some(store), &walks, LABELS_GO_ON);
     let reactor = start_reactor(run, selector, incoming, walks, completion);
     supervise(manager, reactor, no_more_work, serving, run).await

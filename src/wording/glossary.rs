@@ -40,7 +40,8 @@ fn every_status_word_is_explained() {
     let ends = ends.iter().map(|end| end.name().to_owned());
     let causes = {
         use EarlyEndCause::*;
-        [TooHot, NotFinite, LostAtom, Crashed, Trapped, InvalidStart, Other].map(json)
+        [TooHot, NotFinite, LostAtom, Crashed, Trapped, BeyondGrade, UnstableCell, InvalidStart, Other]
+            .map(json)
     };
     let decisions = [
         "begun",

@@ -10,6 +10,8 @@ pub fn cause(cause: EarlyEndCause) -> &'static str {
         EarlyEndCause::LostAtom => "an atom left the structure",
         EarlyEndCause::Crashed => "walkers crashed",
         EarlyEndCause::Trapped => "atoms repeatedly too close",
+        EarlyEndCause::BeyondGrade => "grades repeatedly beyond the bound",
+        EarlyEndCause::UnstableCell => "the cell was not stable",
         EarlyEndCause::InvalidStart => "invalid start",
         EarlyEndCause::Other => "other",
     }

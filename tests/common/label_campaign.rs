@@ -133,7 +133,7 @@ impl LabelCampaign {
         self.pause(&[labeller])
     }
 
-    /// Queues a structure whose label takes a second or more. Returns the name of its candidate.
+    /// Queues a structure whose label takes some seconds. Returns the name of its candidate.
     pub fn queue_large(&self) -> String {
         queue(self.location(), 1, large(), Vec::new())
     }
@@ -205,7 +205,7 @@ pub async fn check_single_labels(store: &Store) -> usize {
 
 /// An fcc aluminium structure whose label takes a while.
 fn large() -> Structure {
-    const CELLS: usize = 28;
+    const CELLS: usize = 38;
     let (a, basis) = (4.05, [[0.0, 0.0, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]]);
     let corners = (0..CELLS.pow(3)).map(|k| [k / CELLS / CELLS, k / CELLS % CELLS, k % CELLS]);
     let atoms = corners.flat_map(|corner| {

@@ -38,6 +38,8 @@ pub enum AgentExit {
     Done,
     /// It was asked to stop, or has lost all its walkers.
     Stopped,
+    /// The orchestrator came back with other settings or another model: the agent must join again with new walkers.
+    SetupChanged,
 }
 
 /// Events of an agent, for monitoring.
@@ -123,7 +125,16 @@ impl Agent {
                     None => break,
                 },
                 Some(exchanged) = state.in_flight.next() => state.exchanged(exchanged)?,
-                joined = answer_to(&mut state.joining) => state.has_joined(joined?),
+                joined = answer_to(&mut state.joining) => {
+                    let joined = joined?;
+                    if joined.setup != state.joined.setup {
+                        // Its walkers have other settings or another model, and so have their reports.
+                        state.pool.dismiss_idle();
+                        joined.leave().await;
+                        return Ok(AgentExit::SetupChanged);
+                    }
+                    state.has_joined(joined);
+                }
                 (reply, took) = answer_to(&mut state.stop_query) => if state.handle_stop_reply(reply, took)? { watch(OrchestratorEvent::Stop) },
                 _ = ticks.tick() => state.poll(self.orchestrator_timeout)?.into_iter().for_each(&mut watch),
                 () = &mut stop => {}

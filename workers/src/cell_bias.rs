@@ -64,7 +64,7 @@ pub struct CellBias {
     steps: u64,
     /// Sums of V/V₀ over the first and the second half of the window.
     sums: [f64; 2],
-    /// Steps of the last contacts with a boundary.
+    /// Steps of the contacts with a boundary within a window before the last.
     contacts: Vec<u64>,
 }
 
@@ -108,20 +108,24 @@ impl CellBias {
         (self.steps, self.sums) = (0, [0.0; 2]);
     }
 
+    /// The bias with its gain multiplied by `factor`, after a roll back.
+    pub fn weakened(self, settings: &CellBiasSettings, factor: f64) -> Self {
+        let [smallest, largest] = settings.gain_range;
+        Self { gain: (factor * self.gain).clamp(smallest, largest), ..self }
+    }
+
     /// Takes note of a contact with a boundary at `step`.
     pub fn touch(&mut self, settings: &CellBiasSettings, step: u64) {
-        if self.contacts.len() >= settings.contacts_to_end as usize {
-            self.contacts.remove(0);
-        }
+        self.contacts.retain(|contact| step.saturating_sub(*contact) <= settings.window);
         self.contacts.push(step);
     }
 
-    /// Whether a walk that has collected this many structures has touched the boundary so often that it ends.
-    pub fn ends(&self, settings: &CellBiasSettings, collected: usize) -> bool {
-        let last_contacts = || self.contacts.first().zip(self.contacts.last());
-        collected >= settings.collected_to_end as usize
-            && self.contacts.len() >= settings.contacts_to_end as usize
-            && last_contacts().is_some_and(|(first, last)| last - first <= settings.window)
+    /// Whether a walk at `step` that has collected this many structures has touched the boundary so often within a window that
+    /// it ends.
+    pub fn ends(&self, settings: &CellBiasSettings, step: u64, collected: usize) -> bool {
+        let recent = |contact: &&u64| step.saturating_sub(**contact) <= settings.window;
+        let contacts = self.contacts.iter().filter(recent).count();
+        collected >= settings.collected_to_end as usize && contacts >= settings.contacts_to_end as usize
     }
 }
 
@@ -171,8 +175,16 @@ mod tests {
         for step in [100, 1000, 2101] {
             bias.touch(&paper(), step);
         }
-        assert!(!bias.ends(&paper(), 500), "in 2001 steps");
+        assert!(!bias.ends(&paper(), 2101, 500), "in 2001 steps");
         bias.touch(&paper(), 2500);
-        assert!(bias.ends(&paper(), 50) && !bias.ends(&paper(), 49));
+        assert!(bias.ends(&paper(), 2500, 50) && !bias.ends(&paper(), 2500, 49));
+        assert!(bias.ends(&paper(), 3000, 50) && !bias.ends(&paper(), 3001, 50), "long after");
+    }
+
+    #[test]
+    fn a_roll_back_weakens_the_bias() {
+        let bias = CellBias::new(&paper(), 0.5).weakened(&paper(), 0.5);
+        assert_eq!(bias.gain(), 0.01);
+        assert_eq!(bias.weakened(&paper(), 0.1).gain(), 0.005, "not below the smallest gain");
     }
 }

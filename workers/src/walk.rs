@@ -70,9 +70,7 @@ pub fn advance(
     let outcome = match running.run(&stopping, &on_progress) {
         Ok(outcome) => outcome,
         Err(WalkError::Unavailable(reason)) => return Err(PotentialUnavailable(reason)),
-        Err(error) => {
-            Outcome::Ended(WalkEnd::Diverged { reason: format!("at step {}: {error}", running.step()) })
-        }
+        Err(error) => Outcome::Ended(WalkEnd::Diverged { reason: format!("{}: {error}", running.place()) }),
     };
     Ok(AssignmentReport {
         walk,
@@ -295,13 +293,14 @@ impl<'a> RunningWalk<'a> {
         self.state.segment += 1;
         self.state.rollbacks += 1;
         self.state.max_consecutive_rejections = 0;
-        self.state.tau *= self.settings.guard.tau_factor;
+        let factor = self.settings.guard.tau_factor;
+        self.state.tau *= factor;
         checkpoint.stream = self.stream();
         let cutoff = self.dynamics.neighbours().cutoff();
         self.state.last_rollback = Some((self.step(), checkpoint.state.step));
         self.dynamics = Dynamics::resume(checkpoint, cutoff, self.settings.skin)?;
         self.potential.state = bias;
-        self.state.cell_bias = cell_bias;
+        self.state.cell_bias = cell_bias.map(|bias| bias.weakened(&self.settings.cell_bias, factor));
         self.state.bias_sum = None;
         self.state.next_offer = self.state.offer_after_rollback(self.step(), self.settings);
         self.save_checkpoint();

@@ -34,7 +34,7 @@ fn from(conditions: WalkConditions, until: u64) -> Assignment {
 /// A structure of the control walk.
 fn frame(settings: &WalkSettings, conditions: WalkConditions, step: u64) -> Candidate {
     let control =
-        Assignment { origin: Origin::Control, frame_steps: vec![step], ..from(conditions, step + 1) };
+        Assignment { origin: Origin::Control, frame_steps: vec![step], ..from(conditions, u64::MAX) };
     let Outcome::Candidate(frame) = run(settings, &control).outcome else { panic!("no frame") };
     frame
 }
@@ -83,7 +83,7 @@ fn a_reference_run_and_a_biased_cell_continue_from_any_step() {
     assert_eq!((&whole.outcome, whole.progress.step), (&Outcome::StepsDone, 90));
     let context =
         WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings.clone()) };
-    let mut next = from(conditions(1.02, true), 0);
+    let mut next = from(conditions(1.02, true), 500);
     // Interrupted twice in the reference run, which counts no steps of the walk.
     for steps in [7, 31] {
         let asked = AtomicU64::new(0);
@@ -92,9 +92,16 @@ fn a_reference_run_and_a_biased_cell_continue_from_any_step() {
         assert_eq!((&report.outcome, report.progress.step), (&Outcome::Interrupted, 0));
         next.checkpoint = Some(report.checkpoint);
     }
-    for last_step in [1, 19, 20, 21, 33, 90] {
+    // An assignment has as many steps of it as it would have of the walk.
+    next.last_step = 5;
+    let report = run(&settings, &next);
+    assert_eq!((&report.outcome, report.progress.step), (&Outcome::StepsDone, 0));
+    next.checkpoint = Some(report.checkpoint);
+    for last_step in [20, 21, 33, 90] {
         next.last_step = last_step;
-        next.checkpoint = Some(run(&settings, &next).checkpoint);
+        let report = run(&settings, &next);
+        assert_eq!((&report.outcome, report.progress.step), (&Outcome::StepsDone, last_step));
+        next.checkpoint = Some(report.checkpoint);
     }
     assert_eq!(next.checkpoint, Some(whole.checkpoint));
 }

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::barostat::{Barostat, CellThermostat};
 use crate::cell_freedom::CellFreedom;
 use crate::nose_hoover::NoseHooverChain;
-use crate::thermostat::Thermostat;
+use crate::thermostat::{Thermostat, ThermostatSettings};
 use crate::volume_ramp::extent;
 use crate::wrong_setting::WrongSetting;
 
@@ -69,6 +69,17 @@ impl BarostatSettings {
             volume_range: None,
             reflections: 0,
         }
+    }
+
+    /// Why a run of `structure` under this thermostat at `temperature` (K) cannot have this barostat, if it cannot.
+    pub fn fault(
+        &self,
+        temperature: f64,
+        thermostat: &ThermostatSettings,
+        structure: &Structure,
+    ) -> Option<&'static str> {
+        let thermostat = thermostat.start(temperature);
+        self.start(temperature, &thermostat, structure).invalid_setting(&thermostat, structure)
     }
 
     /// The first setting with an impossible value.

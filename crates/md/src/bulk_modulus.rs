@@ -19,6 +19,11 @@ pub fn bulk_modulus(structure: &Structure, potential: &mut dyn Potential) -> Res
     if structure.periodic == [false; 3] {
         return Err(DynamicsError::Barostat("a cluster has no volume"));
     }
+    if structure.cell.volume() == 0.0 {
+        return Err(DynamicsError::Barostat(
+            "the lattice vectors do not span space, so the cell has no volume",
+        ));
+    }
     let mut neighbours = NeighbourList::new(potential.cutoff(), 0.0);
     let mut evaluation = Evaluation::default();
     let mut energies = [0.0; 5];

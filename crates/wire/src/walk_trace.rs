@@ -21,7 +21,7 @@ pub struct TracePoint {
     pub time: f64,
     /// Kinetic temperature, K.
     pub temperature: f64,
-    /// A third of the trace of the pressure tensor, compression positive, GPa, with the stress of the bias. `None` without
+    /// A third of the trace of the pressure tensor, compression positive, GPa, without the bias. `None` without
     /// periodic directions.
     pub pressure: Option<f64>,
     /// V / V₀.

@@ -13,11 +13,12 @@ pub(super) fn check_constant_pressure(config: &Config) -> Result<(), InvalidValu
     if let Some(barostat) = &walk.barostat {
         if walk.volume_ramp.is_some() {
             let expected = "either walk.barostat or walk.volume_ramp: a cell follows a pressure or a ramp";
-            return wrong("walk.volume_ramp", "a ramp beside walk.barostat", expected);
+            return wrong("walk.volume_ramp", "given together with walk.barostat", expected);
         }
         if let Some(WrongSetting { key, found, expected }) = barostat.wrong() {
             return wrong(&format!("walk.barostat.{key}"), found, expected);
         }
+        check_each("walk.barostat.stress", "walk.barostat.pressure", barostat.stress)?;
     }
     let bias = walk.cell_bias.unwrap_or_default();
     check_cell_bias(&bias)?;
@@ -32,14 +33,20 @@ pub(super) fn check_constant_pressure(config: &Config) -> Result<(), InvalidValu
     {
         return wrong(
             &format!("walk.{name}"),
-            "no barostat",
+            "given without a barostat",
             "walk.barostat, or pressures in a group of walks",
         );
     }
-    if walk.cell_bias.is_some() {
+    if walk.cell_bias.is_some() && walks.is_empty() {
         check_start_volumes("walk.start_volume", &[walk.start_volume], &bias)?;
     }
     Ok(())
+}
+
+/// Checks each number of a list at `key` against the range of another key.
+fn check_each<const N: usize>(key: &str, with_range: &str, numbers: [f64; N]) -> Result<(), InvalidValue> {
+    let wrong_number = numbers.into_iter().find_map(|number| ranges::expected_instead(with_range, number));
+    wrong_number.map_or(Ok(()), |(found, expected)| wrong(key, found, expected))
 }
 
 fn check_group(
@@ -52,18 +59,21 @@ fn check_group(
     let key = |name: &str| format!("walks.{number}.{name}");
     if !group.pressures.is_empty() && !group.volume_ramps.is_empty() {
         let expected = "either pressures or volume_ramps: a cell follows a pressure or a ramp";
-        return wrong(&key("volume_ramps"), "ramps beside pressures", expected);
+        return wrong(&key("volume_ramps"), "given together with pressures", expected);
     }
     let has_barostat =
         !group.pressures.is_empty() || walk.barostat.is_some() && group.volume_ramps.is_empty();
     if !has_barostat && (!group.start_volumes.is_empty() || group.cell_bias == Some(true)) {
         let name = if group.start_volumes.is_empty() { "cell_bias" } else { "start_volumes" };
-        return wrong(&key(name), "a group without a barostat", "pressures in the group, or walk.barostat");
+        return wrong(&key(name), "given without a barostat", "pressures in the group, or walk.barostat");
     }
-    if group.cell_bias.unwrap_or(walk.cell_bias.is_some()) {
-        check_start_volumes(&key("start_volumes"), &group.start_volumes, bias)?;
+    if !has_barostat || !group.cell_bias.unwrap_or(walk.cell_bias.is_some()) {
+        return Ok(());
     }
-    Ok(())
+    if group.start_volumes.is_empty() {
+        return check_start_volumes("walk.start_volume", &[walk.start_volume], bias);
+    }
+    check_start_volumes(&key("start_volumes"), &group.start_volumes, bias)
 }
 
 fn check_cell_bias(bias: &CellBiasSection) -> Result<(), InvalidValue> {
@@ -78,6 +88,7 @@ fn check_cell_bias(bias: &CellBiasSection) -> Result<(), InvalidValue> {
             "the smallest gain and the largest, and gain between them",
         );
     }
+    check_each("walk.cell_bias.gain_range", "walk.cell_bias.gain", gain_range.map(Positive::get))?;
     if min_drift >= max_drift {
         return wrong(
             "walk.cell_bias.max_drift",
@@ -87,12 +98,9 @@ fn check_cell_bias(bias: &CellBiasSection) -> Result<(), InvalidValue> {
     }
     let [low, high] = volume_range.map(Positive::get);
     let possible = |volume: f64| ranges::expected_instead("walk.start_volume", volume).is_none();
-    if !(low < 1.0 && high > 1.0 && possible(low) && possible(high)) {
-        return wrong(
-            "walk.cell_bias.volume_range",
-            shown(*volume_range),
-            "V/V₀, such as [0.75, 1.3], with 1 between them",
-        );
+    if !(low < 1.0 && high > 1.0 && high - low > 0.1 && possible(low) && possible(high)) {
+        let expected = "two V/V₀ with 1 between them, more than 0.1 apart, such as [0.75, 1.3]";
+        return wrong("walk.cell_bias.volume_range", shown(*volume_range), expected);
     }
     Ok(())
 }

@@ -87,19 +87,23 @@ pub(super) fn cell_bias(
 }
 
 impl RunningWalk<'_> {
-    /// Runs what is left of the reference run, and puts the walk at its start.
+    /// Runs what is left of the reference run, at most as many steps as the assignment has, and puts the walk at its start.
     pub(super) fn finish_reference_run(
         &mut self,
         stopping: &impl Fn() -> bool,
         on_progress: &impl Fn(WalkProgress),
     ) -> Result<Option<Outcome<Candidate>>, WalkError> {
         let steps = self.settings.reference_steps;
+        let last_step = self.dynamics.state().step.saturating_add(self.assignment.last_step);
         while let Some(mut run) = self.state.reference_run {
             let step = self.dynamics.state().step;
             if step >= steps {
                 let volume = run.volumes / (steps - steps / 2) as f64;
                 self.start_from_reference(volume)?;
                 break;
+            }
+            if step >= last_step {
+                return Ok(Some(Outcome::StepsDone));
             }
             if stopping() {
                 return Ok(Some(Outcome::Interrupted));
@@ -138,6 +142,14 @@ impl RunningWalk<'_> {
         Ok(())
     }
 
+    /// Where the walk is, for the reason of its end: `at step 12`.
+    pub(super) fn place(&self) -> String {
+        match self.state.reference_run {
+            Some(_) => format!("at step {} of the reference run", self.dynamics.state().step),
+            None => format!("at step {}", self.step()),
+        }
+    }
+
     /// Takes note of the volume after a step with a biased cell.
     pub(super) fn observe_cell(&mut self, reflections_before: u64) {
         let (step, volume) = (self.step(), self.relative_volume());
@@ -157,7 +169,8 @@ impl RunningWalk<'_> {
     /// Whether the walk has collected enough and touches a boundary of its volume again and again.
     pub(super) fn is_at_volume_boundary(&self) -> bool {
         let WalkState { cell_bias, collected, .. } = &self.state;
-        cell_bias.as_ref().is_some_and(|bias| bias.ends(&self.settings.cell_bias, collected.len()))
+        let step = self.step();
+        cell_bias.as_ref().is_some_and(|bias| bias.ends(&self.settings.cell_bias, step, collected.len()))
     }
 
     fn cell_motion(&self) -> &CellMotion {

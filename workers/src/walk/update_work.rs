@@ -27,10 +27,10 @@ impl RunningWalk<'_> {
         if version == self.mixture_version || self.potential.state.gradient_norm <= 0.0 {
             return Ok(());
         }
-        self.state.bias_sum = None;
         // The bias is off in this evaluation, which no average follows.
         self.potential.tau = 0.0;
         let after: f64 = gamma(&mut self.potential, &self.dynamics)?.iter().sum();
+        self.state.bias_sum = Some((self.mixture_version, after));
         let averages = self.potential.state;
         let scale = self.state.tau * averages.force_norm / averages.gradient_norm;
         let work = scale * (before - after);
@@ -40,6 +40,7 @@ impl RunningWalk<'_> {
         let kept = (present - work).max(FLOOR * thermal);
         if kept < present {
             self.dynamics.scale_velocities((kept / present).sqrt());
+            self.potential.state.work.total += kept - present;
         }
         Ok(())
     }
