@@ -237,10 +237,36 @@ fn foundation_campaign(name: &str, walks: usize) -> String {
     text
 }
 
+/// With walks of 300 instead of 100,000 biased steps.
+#[test]
+fn driven_walks_in_aluminium_run() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut text = demo("al-collect.toml");
+    for [key, whole, short] in [
+        ["biased_steps", "100000", "300"],
+        ["reference_steps", "5000", "60"],
+        ["equilibration_steps", "500", "40"],
+    ] {
+        let before = format!("\n{key} = {whole}\n");
+        assert!(text.contains(&before), "{before}");
+        text = text.replacen(&before, &format!("\n{key} = {short}\n"), 1);
+    }
+    fs::write(directory.path().join("c.toml"), text).unwrap();
+    succeed(directory.path(), ["run", "c.toml", "--directory", "here"]);
+    let status: Value =
+        serde_json::from_str(&succeed(directory.path(), ["status", "here", "--json"])).unwrap();
+    let walks = status["walks"].as_array().unwrap();
+    let volumes: Vec<_> = walks.iter().map(|walk| walk["relative_volume"].as_f64().unwrap()).collect();
+    assert!(walks.iter().all(|walk| walk["state"] == "completed" && walk["step"] == 340), "{status}");
+    assert!(volumes.iter().all(|volume| (0.75..=1.3).contains(volume)), "{volumes:?}");
+    assert_eq!(volumes.len(), 4);
+}
+
 #[test]
 fn every_file_of_configs_is_run_by_a_test() {
     // `cargo test --test external dft::` runs silicon-dft.toml, and `batch_systems` campaigns with lsf.toml and pbs.toml.
     let run = [
+        "al-collect.toml",
         "aluminium.toml",
         "foundation-campaign.toml",
         "foundation-expansion.toml",
