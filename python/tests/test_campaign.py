@@ -334,14 +334,16 @@ class DamageTests(CampaignCase):
 
     def test_a_flipped_bit_is_detected_wherever_it_is(self) -> None:
         name = next(self.campaign.candidates()).id
-        one = f"WHERE decision = (SELECT decision FROM candidate WHERE id = '{name}')"
+        its_decision = f"(SELECT decision FROM candidate WHERE id = '{name}')"
+        one = f"WHERE decision = {its_decision}"
+        another = f"(SELECT max(block) FROM candidate_data WHERE decision <> {its_decision})"
         damages = {
             f"UPDATE candidate_data SET block = flip(block, 300) {one}": "damaged candidate block: checksum",
             f"UPDATE candidate_data SET block = flip(block, 3) {one}": "not a candidate block",
             f"UPDATE candidate_data SET block = flip(block, 9) {one}": "candidate block of version",
             f"UPDATE candidate_data SET block = flip(block, 25) {one}": "its header says",
             f"UPDATE candidate_data SET block = substr(block, 1, 100) {one}": "too short: 100 bytes",
-            f"UPDATE candidate_data SET block = (SELECT max(block) FROM candidate_data) {one}": "its block is that of",
+            f"UPDATE candidate_data SET block = {another} {one}": "its block is that of",
             f"UPDATE candidate_data SET features = flip(features, 70) {one}": "the features of the candidate",
             f"UPDATE candidate_data SET original_grades = flip(original_grades, 9) {one}": "the original grades of",
             f"UPDATE candidate SET energy = energy + 1e-9 {one}": "candidate [0-9]+: its content has the checksum",
