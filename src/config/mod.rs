@@ -21,6 +21,7 @@ mod refit;
 mod schema;
 mod sections;
 mod stop;
+mod walk;
 mod warning;
 
 use std::path::{Path, PathBuf};
@@ -50,6 +51,7 @@ pub use refit::*;
 pub use schema::schema_text;
 pub use sections::*;
 pub use stop::StopSection;
+pub use walk::*;
 pub use warning::Warning;
 
 /// A whole campaign.
