@@ -7,6 +7,7 @@ use std::path::PathBuf;
 
 use atoms::{CloseContact, Repetition, Structure, extxyz, read_structures};
 use calm::rules::Positive;
+use md::BarostatSettings;
 use orchestrator::selector::SeedStructurePlan;
 use potentials::ModelWithFeatures;
 use toml::Spanned;
@@ -221,20 +222,19 @@ impl Loader<'_> {
             ));
         }
         // Groups of walks say for themselves which of them change the volume.
-        let WalkSection { volume_ramp, barostat, .. } = &self.config.walk;
-        let changes = [("walk.volume_ramp", volume_ramp.is_some()), ("walk.barostat", barostat.is_some())];
-        let changes_volume = changes.into_iter().find(|(_, given)| *given && self.config.walks.is_empty());
-        if let Some((key, _)) = changes_volume
-            && structure.periodic == [false; 3]
-        {
-            return Err(format!(
-                "the structure has no periodic direction, and so no volume for {key} to change; give it a \
-                 cell (Lattice=… in its comment line), or leave {key} out"
-            ));
+        if !self.config.walks.is_empty() {
+            return Ok(());
         }
-        let WalkSection { barostat, temperature, thermostat, .. } = &self.config.walk;
-        let barostat = barostat.as_ref().filter(|_| self.config.walks.is_empty());
-        if let Some(fault) = barostat.and_then(|of| of.fault(temperature.get(), thermostat, structure)) {
+        let WalkSection { volume_ramp, barostat, temperature, thermostat, .. } = &self.config.walk;
+        if volume_ramp.is_some() && structure.periodic == [false; 3] {
+            return Err(
+                "the structure has no periodic direction, and so no volume for walk.volume_ramp to change; give it a \
+                 cell (Lattice=… in its comment line), or leave walk.volume_ramp out"
+                    .to_owned(),
+            );
+        }
+        let fault = |barostat: &BarostatSettings| barostat.fault(temperature.get(), thermostat, structure);
+        if let Some(fault) = barostat.as_ref().and_then(fault) {
             return Err(format!("walk.barostat: {fault}"));
         }
         Ok(())
