@@ -63,7 +63,7 @@ impl Running<'_> {
         let bonds: usize = tickets.iter().map(|one| one.shape.bonds).sum();
         let is_device = matches!(fault, Fault::Memory(_));
         match fault {
-            Fault::Memory(message) | Fault::Arena(message) if tickets.len() > 1 => {
+            Fault::Memory(message) | Fault::Arena(message) if tickets.len() > 1 && bonds > 0 => {
                 warn!(
                     message,
                     structures = tickets.len(),
@@ -129,11 +129,14 @@ impl Running<'_> {
             if let Some(server) = self.server.take() {
                 fault = server.end(fault);
             }
+            if fault == Fault::Stopped {
+                return self.give_up("interrupted while the model's server was started again");
+            }
             self.failures += 1;
             let message = fault.message().to_owned();
             warn!(message, failures = self.failures, "the python server failed");
             self.setup.note(|statistics| statistics.last_failure = Some(message.clone()));
-            if self.failures >= MAX_FAILURES || fault == Fault::Stopped {
+            if self.failures >= MAX_FAILURES {
                 let reason = format!(
                     "the model's server failed {MAX_FAILURES} times in a row; the last time: {message}"
                 );

@@ -53,7 +53,7 @@ fn begin<'a>(
     setup: &'a DeviceSetup,
     progress: &'a dyn Fn(&str),
 ) -> Result<(Running<'a>, DeviceInfo), DeviceError> {
-    // Nobody can call yet.
+    // No walker knows the device before it has started.
     let early = &mut Vec::new();
     progress(&format!("starting {}", setup.settings.names()));
     let mut server = Server::start(setup, 0, early).map_err(start_error)?;
