@@ -1,7 +1,7 @@
 # What the stand-ins for PBS and LSF share: a queue of jobs on this host, in the directory $STAND_IN_QUEUE.
 #
 # Each job is a directory, named by its number, with the files script, name, output, after (number of the job whose start it waits for)
-# and state: PEND, RUN, DONE, EXIT. While the file `hold` exists, jobs wait; while `full` exists, none is accepted; while `down` exists,
+# and state: PEND, RUN, DONE, EXIT; `begun` is made by who begins or cancels it. While the file `hold` exists, jobs wait; while `full` exists, none is accepted; while `down` exists,
 # the batch system does not answer.
 queue=${STAND_IN_QUEUE:?}
 mkdir -p "$queue"
@@ -27,8 +27,12 @@ new_job() {
 end_job() {
     local job=$1 signal
     shift
+    if mkdir "$queue/$job/begun" 2>/dev/null; then
+        set_state "$job" EXIT
+        return
+    fi
+    while [ "$(state "$job")" = PEND ]; do sleep 0.01; done
     case $(state "$job") in
-        PEND) set_state "$job" EXIT ;;
         RUN)
             for signal in "$@"; do
                 # shellcheck disable=SC2046

@@ -3,12 +3,16 @@
 job=$1
 after=$(cat "$queue/$job/after")
 while [ -d "$queue" ] && { [ -e "$queue/hold" ] || { [ -n "$after" ] && [ "$(state "$after")" = PEND ]; }; }; do sleep 0.05; done
-[ "$(state "$job")" = PEND ] || exit 0
+# Either it begins, or it was cancelled before.
+mkdir "$queue/$job/begun" 2>/dev/null || exit 0
 output=$(cat "$queue/$job/output")
 # The shell lets background processes ignore SIGINT.
 env --default-signal=INT setsid bash "$queue/$job/script" >> "${output:-/dev/null}" 2>&1 </dev/null &
-echo $! > "$queue/$job/session"
+session=$!
+echo "$session" > "$queue/$job/session"
+# Who cancels a running job signals its session.
+while kill -0 "$session" 2>/dev/null && [ -z "$(ps -o pid= -s "$session")" ]; do sleep 0.01; done
 set_state "$job" RUN
-wait $!
+wait "$session"
 code=$?
 [ ! -d "$queue/$job" ] || set_state "$job" "$([ "$code" = 0 ] && echo DONE || echo EXIT)"

@@ -61,10 +61,10 @@ impl StandIn {
         if on { fs::write(path, "").unwrap() } else { fs::remove_file(path).unwrap() }
     }
 
-    /// A job that ends when the file `go` exists, with this exit code.
+    /// A job that ends when the file `go` exists, with this exit code, or with its directory.
     fn job(&self, name: &str, code: i32) -> PathBuf {
         let here = self.home.path().display().to_string();
-        let command = format!("until [ -e {here}/go ]; do sleep 0.02; done; exit {code}");
+        let command = format!("until [ -e {here}/go ] || [ ! -d {here} ]; do sleep 0.02; done; exit {code}");
         let request = JobRequest {
             name: name.to_owned(),
             directory: self.home.path().to_owned(),
