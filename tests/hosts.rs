@@ -126,6 +126,34 @@ fn kill(running: &mut Running) {
     running.0.wait().unwrap();
 }
 
+/// What an agent has of the orchestrator's settings is that of the orchestrator that runs.
+#[test]
+fn an_agent_takes_up_the_settings_of_the_next_orchestrator() {
+    let small = Small::default();
+    let hosts = hosts(&small, 1);
+    let mut orchestrator = hosts.start_orchestrator();
+    let held = pause_walkers(hosts.home.path(), 1);
+    let mut agent = hosts.agent(0);
+    wait_until("the agent works", || !processes_running(hosts.others[0].path(), "walker").is_empty());
+    kill(&mut orchestrator);
+    drop(held);
+    let path = hosts.home.path().join("campaign.toml");
+    let text = fs::read_to_string(&path).unwrap();
+    fs::write(&path, text.replace("[run]\n", "[run]\nmax_restarts = 7\n")).unwrap();
+    let mut orchestrator = hosts.start_orchestrator();
+    // The campaign must not end before the agent is back.
+    let held = pause_walkers(hosts.home.path(), 1);
+    wait_until("the agent joins again", || {
+        let said = hosts.said(0);
+        said.contains("other settings now: joining again") && said.matches("joined: 1 walker,").count() == 2
+    });
+    held.resume();
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.orchestrator_stderr());
+    assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
+    assert_eq!(outcome(hosts.home.path()), uninterrupted_outcome(&small));
+    hosts.assert_cleaned_up();
+}
+
 /// Kills the orchestrator, an agent, or a walker of an agent, and restarts what was killed.
 #[test]
 fn kills_on_every_host_change_nothing() {

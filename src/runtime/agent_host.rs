@@ -94,11 +94,20 @@ async fn run_version(
         joined.newest().await.version()
     ));
     let skin = setup.settings.skin;
-    let devices = match agent_model::start_devices(&setup.model, python, skin, walkers, stop).await {
-        Ok(devices) if !stop.is_cancelled() => devices,
+    let start = stop.child_token();
+    let mut started = pin!(agent_model::start_devices(&setup.model, python, skin, walkers, &start));
+    let (devices, end) = tokio::select! {
+        devices = &mut started => (devices, ExitStatus::Interrupted),
+        end = called_off(&joined, address) => {
+            start.cancel();
+            (started.await, end)
+        }
+    };
+    let devices = match devices {
+        Ok(devices) if !start.is_cancelled() => devices,
         ended => {
             joined.leave().await;
-            return ended.map(|_| (ExitStatus::Interrupted, false));
+            return ended.map(|_| (end, false));
         }
     };
     let shm_dir = ShmDir::for_campaign(directory).map_err(CommandError::failed)?;
@@ -138,6 +147,22 @@ async fn run_version(
             }
             Ok((ended, setup.has_versions))
         }
+    }
+}
+
+/// Waits until the orchestrator asks its agents to stop, or the campaign is over, and returns how the agent ends then.
+async fn called_off(joined: &Membership, address: &Address) -> ExitStatus {
+    let asked = async {
+        loop {
+            tokio::time::sleep(STATUS_INTERVAL).await;
+            if matches!(joined.is_stopping().await, Ok(Some(true))) {
+                return ExitStatus::Interrupted;
+            }
+        }
+    };
+    tokio::select! {
+        end = asked => end,
+        () = address.wait_until_over() => ExitStatus::Done,
     }
 }
 

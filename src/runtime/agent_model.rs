@@ -66,7 +66,7 @@ pub async fn with_files(
 /// Makes sure that a file of the orchestrator is on this host: as it is, or as a copy, which is downloaded. Returns whether this agent
 /// is still a member.
 async fn has_file(joined: &Membership, file: &mut HashedFile, copy: PathBuf) -> Result<bool, CommandError> {
-    if verify_hash(&file.path, &file.hash).is_ok() {
+    if is_on_this_host(file).await? {
         return Ok(true);
     }
     log_and_print(format_args!(
@@ -82,6 +82,13 @@ async fn has_file(joined: &Membership, file: &mut HashedFile, copy: PathBuf) -> 
     verify_hash(&copy, &file.hash).map_err(CommandError::failed)?;
     file.path = copy;
     Ok(true)
+}
+
+/// Whether a regular file at the orchestrator's path has the content of the orchestrator's. A large file takes a while to read.
+async fn is_on_this_host(file: &HashedFile) -> Result<bool, CommandError> {
+    let file = file.clone();
+    let read = move || file.path.is_file() && verify_hash(&file.path, &file.hash).is_ok();
+    spawn_blocking(read).await.map_err(CommandError::failed)
 }
 
 impl AgentPythonModel {
