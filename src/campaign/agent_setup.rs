@@ -27,7 +27,7 @@ impl LoadedCampaign {
             model,
             settings: self.walk_settings(),
             message_bytes: self.largest_message(),
-            heartbeat_timeout: run.heartbeat_timeout.seconds(),
+            heartbeat_timeout: self.config.walker_heartbeat_timeout().as_secs_f64(),
             max_restarts: run.max_restarts,
             has_versions: self.config.refit.is_some(),
         })

@@ -289,6 +289,12 @@ impl Config {
         by_labels.map(|labels| (labels, "budget.labels")).into_iter().chain(total).min()
     }
 
+    /// Time without a heartbeat after which a walker is replaced. A walker whose call waits for a model in Python sends none.
+    pub fn walker_heartbeat_timeout(&self) -> std::time::Duration {
+        let of_calls = self.potential.python.as_ref().map(PythonSection::longest_call);
+        self.run.heartbeat_timeout.get().max(of_calls.unwrap_or_default())
+    }
+
     /// The limits that the store holds labellers to.
     pub fn budget(&self) -> store::Budget {
         let BudgetSection { labels, core_hours, wall_time } = self.budget.clone();

@@ -74,6 +74,11 @@ impl PythonSection {
         self.device.names().iter().map(of_device).collect()
     }
 
+    /// Longest time that a walker can wait for a call: for the shape that compiles, and then for its own.
+    pub(super) fn longest_call(&self) -> std::time::Duration {
+        self.compile_timeout.get() + self.timeout.get()
+    }
+
     /// Resolves paths relative to the directory of the configuration.
     pub(super) fn resolve_paths(&mut self, directory: &Path) {
         self.environment = directory.join(&self.environment);
@@ -137,7 +142,22 @@ impl<'de> Deserialize<'de> for DeviceNames {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
+    use crate::config::{Config, demo_without_refit};
+
+    #[test]
+    fn walkers_may_wait_for_the_longest_call() {
+        let timeout = |lines: &str| {
+            let text = demo_without_refit().replacen("[calm]", &format!("{lines}\n[calm]"), 1);
+            Config::from_draft(Path::new("c.toml"), text).unwrap().config.walker_heartbeat_timeout().as_secs()
+        };
+        let python = "[potential.python]\nenvironment = \"venv\"\nadapter = \"mace\"";
+        assert_eq!(timeout(""), 120);
+        assert_eq!(timeout(&format!("{python}\ncompile_timeout = \"5m\"\ntimeout = \"20s\"")), 320);
+        assert_eq!(timeout(&format!("{python}\ncompile_timeout = \"30s\"\ntimeout = \"20s\"")), 120);
+    }
 
     #[test]
     fn a_device_is_a_text_or_a_list() {

@@ -77,7 +77,7 @@ async fn run_in(
     // The manager cancels it too, when the run cannot go on.
     let stopping = run.stop.child_token();
     let limits = Limits {
-        heartbeat_timeout: campaign.config.run.heartbeat_timeout.get(),
+        heartbeat_timeout: campaign.config.walker_heartbeat_timeout(),
         max_restarts: campaign.config.run.max_restarts,
         ..Limits::default()
     };
@@ -86,7 +86,7 @@ async fn run_in(
     let launch = walker_launcher(model, addresses, threads, campaign.walk_settings(), line.clone());
     let walkers = Children::new(wanted_walkers(&campaign.config), limits, launch);
     let limits = Limits {
-        heartbeat_timeout: limits.heartbeat_timeout.max(LABELLER_TIMEOUT),
+        heartbeat_timeout: campaign.config.run.heartbeat_timeout.get().max(LABELLER_TIMEOUT),
         detached: true,
         ..limits
     };

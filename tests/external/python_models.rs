@@ -80,7 +80,9 @@ fn faults_of_the_server_change_nothing() {
         here,
         &adapter(
             "simulated",
-            &format!("timeout = \"3s\"\noptions = {{ control = {control:?}, count = {count:?} }}"),
+            &format!(
+                "timeout = \"3s\"\ncompile_timeout = \"20s\"\noptions = {{ control = {control:?}, count = {count:?} }}"
+            ),
         ),
     );
     succeed(here, ["run", "campaign.toml", "--directory", "plain", "--in-process"]);
