@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
 /// Every package, its folder, and the packages that it may depend on.
-const HOUSE: [(&str, &str, &[&str]); 17] = [
+pub const HOUSE: [(&str, &str, &[&str]); 17] = [
     ("atoms", "crates/atoms", &[]),
     ("npz", "crates/npz", &[]),
     ("calm", "crates/calm", &["npz"]),

@@ -27,6 +27,7 @@ mod exclude;
 mod explain;
 mod export;
 mod failing_walks;
+mod file_circles;
 mod floods;
 mod forgetting;
 mod going_on;

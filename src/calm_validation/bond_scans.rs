@@ -94,6 +94,28 @@ pub fn distances(scans: &[BondScan], of_ground_states: bool) -> BTreeMap<String,
     scans.map(|scan| (scan.element.clone(), scan.equilibrium)).collect()
 }
 
+/// Detection in the scans of all ground states, without prototypes in their place: yes only if it is yes in every scan that has the regime.
+/// Of the largest values, the smallest; of the others, the largest.
+pub fn combined_detection(scans: &[BondScan], score: usize) -> Detection {
+    let all: Vec<_> = scans
+        .iter()
+        .filter(|scan| scan.is_ground_state && scan.is_own)
+        .map(|scan| scan.detection[score])
+        .collect();
+    let every = |of: fn(&Detection) -> Option<bool>| all.iter().filter_map(of).reduce(|a, b| a && b);
+    let extreme =
+        |of: fn(&Detection) -> Option<f64>, pick: fn(f64, f64) -> f64| all.iter().filter_map(of).reduce(pick);
+    Detection {
+        compression: every(|found| found.compression),
+        stretching: every(|found| found.stretching),
+        interpolation: every(|found| found.interpolation),
+        largest_in_compression: extreme(|found| found.largest_in_compression, f64::min),
+        largest_in_stretching: extreme(|found| found.largest_in_stretching, f64::min),
+        at_equilibrium: extreme(|found| found.at_equilibrium, f64::max),
+        median_near_equilibrium: extreme(|found| found.median_near_equilibrium, f64::max),
+    }
+}
+
 fn scan(
     grader: &mut ValidationGrader,
     subject: &Subject,

@@ -2,8 +2,6 @@
 
 use serde::Serialize;
 
-use super::BondScan;
-
 /// Compression is shorter than this, in distances of equilibrium.
 pub const COMPRESSION: f64 = 0.8;
 /// Stretching is longer than this, in distances of equilibrium, and shorter than [`LONGEST`].
@@ -81,28 +79,6 @@ pub fn detect(
         largest_in_stretching: stretched,
         at_equilibrium,
         median_near_equilibrium: median,
-    }
-}
-
-/// Detection in the scans of all ground states, without crystals that stand in: yes only if it is yes in every scan that has the regime. The values are the smallest
-/// of the largest, and the others the largest.
-pub fn of_all(scans: &[BondScan], score: usize) -> Detection {
-    let all: Vec<_> = scans
-        .iter()
-        .filter(|scan| scan.is_ground_state && scan.is_own)
-        .map(|scan| scan.detection[score])
-        .collect();
-    let every = |of: fn(&Detection) -> Option<bool>| all.iter().filter_map(of).reduce(|a, b| a && b);
-    let extreme =
-        |of: fn(&Detection) -> Option<f64>, pick: fn(f64, f64) -> f64| all.iter().filter_map(of).reduce(pick);
-    Detection {
-        compression: every(|found| found.compression),
-        stretching: every(|found| found.stretching),
-        interpolation: every(|found| found.interpolation),
-        largest_in_compression: extreme(|found| found.largest_in_compression, f64::min),
-        largest_in_stretching: extreme(|found| found.largest_in_stretching, f64::min),
-        at_equilibrium: extreme(|found| found.at_equilibrium, f64::max),
-        median_near_equilibrium: extreme(|found| found.median_near_equilibrium, f64::max),
     }
 }
 

@@ -165,7 +165,7 @@ pub fn run(
     let described = |(k, (name, rule)): (usize, (String, Option<DetectionRule>))| ScoreDescription {
         name,
         rule,
-        detection: detection::of_all(&bond_scans, k),
+        detection: bond_scans::combined_detection(&bond_scans, k),
     };
     Ok(Some(Validation {
         elements: subject.model.elements().iter().map(|species| species.to_string()).collect(),

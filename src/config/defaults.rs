@@ -8,7 +8,6 @@ use orchestrator::selector::UpdateProtocol;
 use store::LowerStateRule;
 use workers::labeller::LabelBounds;
 
-use super::python::DeviceNames;
 use crate::duration::Duration;
 
 pub fn positive(x: f64) -> Positive {
@@ -152,10 +151,6 @@ pub fn max_held_out_error_ratio() -> Positive {
 
 pub fn refit_attempts() -> NonZeroU32 {
     nonzero(3)
-}
-
-pub fn python_device() -> DeviceNames {
-    DeviceNames::One("cpu".to_owned())
 }
 
 pub fn max_batch() -> NonZeroU32 {

@@ -29,7 +29,7 @@ pub struct PythonSection {
     #[schemars(with = "std::collections::BTreeMap<String, serde_json::Value>")]
     pub options: serde_json::Map<String, serde_json::Value>,
     /// Device that evaluates the model: `cpu`, `cuda`, `cuda:1`, …; or a list of devices, over which walkers are dealt evenly.
-    #[serde(default = "defaults::python_device")]
+    #[serde(default)]
     pub device: DeviceNames,
     /// Number of processor threads of the program.
     #[serde(default = "defaults::repeats")]
@@ -99,6 +99,12 @@ pub enum DeviceNames {
     One(String),
     /// At least one, each with a program of its own.
     Several(#[schemars(length(min = 1))] Vec<String>),
+}
+
+impl Default for DeviceNames {
+    fn default() -> Self {
+        Self::One("cpu".into())
+    }
 }
 
 impl DeviceNames {

@@ -4,9 +4,10 @@ use super::Baseline;
 use super::d_optimality::DOptimalityBuilder;
 use super::distances::{Euclidean, KNearestBuilder};
 use super::error::{BaselineError, check};
+use super::kind::BaselineKind;
 use super::likelihood::Likelihood;
 use super::llpr::LlprBuilder;
-use super::settings::{BaselineKind, BaselineSettings};
+use super::settings::BaselineSettings;
 use crate::mixture::Mixture;
 
 /// A baseline under construction.

@@ -2,8 +2,9 @@
 
 use super::error::BaselineError;
 use super::groups::{AtomGroups, for_each_group, subtract};
+use super::kind::BaselineKind;
 use super::max_vol::{ActiveSet, Tolerances};
-use super::settings::{BaselineKind, BaselineSettings};
+use super::settings::BaselineSettings;
 use crate::mixture::Mixture;
 
 /// Rows that are taken into account at once.

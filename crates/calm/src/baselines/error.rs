@@ -1,5 +1,6 @@
 //! What can be wrong with the input of a baseline.
 
+use super::kind::BaselineKind;
 use crate::linear::{LinearError, row_dots};
 
 /// Why a baseline cannot be built or cannot score.
@@ -47,7 +48,7 @@ pub enum BaselineError {
     #[error("{kind} needs a mixture of the same features")]
     NoMixture {
         /// The kind.
-        kind: super::BaselineKind,
+        kind: BaselineKind,
     },
     /// A mixture that does not fit the features.
     #[error("the mixture has {found} {what}, expected {expected}")]

@@ -8,8 +8,9 @@ use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, Par};
 
 use super::error::{BaselineError, check_rows};
+use super::kind::BaselineKind;
 use super::max_vol::multiply_transposed;
-use super::settings::{BaselineKind, BaselineSettings};
+use super::settings::BaselineSettings;
 use crate::linear::{LinearError, dot, eigen, trace, view};
 
 /// Rows that are added to G at once.

@@ -24,9 +24,11 @@ mod distances;
 mod error;
 mod file;
 mod groups;
+mod kind;
 mod likelihood;
 mod llpr;
 mod max_vol;
+mod origin;
 mod settings;
 mod stored;
 
@@ -34,10 +36,12 @@ pub use builder::Builder;
 pub use d_optimality::DOptimality;
 pub use distances::{Euclidean, KNearest};
 pub use error::{BaselineError, OriginMismatch};
-pub use file::{BaselineFile, FeatureOrigin};
+pub use file::BaselineFile;
+pub use kind::BaselineKind;
 pub use likelihood::Likelihood;
 pub use llpr::Llpr;
-pub use settings::{BaselineKind, BaselineSettings};
+pub use origin::FeatureOrigin;
+pub use settings::BaselineSettings;
 
 /// A score that is ready for use.
 #[derive(Debug, Clone, PartialEq)]
