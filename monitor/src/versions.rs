@@ -252,7 +252,7 @@ pub async fn newest_with_labels(
         return Ok(0);
     }
     let labels = store.labels_by_walk(protocol).await?;
-    Ok(labels.iter().map(|(walk, _)| versions.of(*walk)).max().unwrap_or_else(|| versions.newest()))
+    Ok(labels.iter().map(|(walk, _)| versions.version_of(*walk)).max().unwrap_or_else(|| versions.newest()))
 }
 
 fn summaries(
@@ -268,7 +268,7 @@ fn summaries(
     }
     let versions = WalkVersions::from_walks(walks.iter().map(|walk| (walk.walk, version_of(walk))));
     for (walk, number) in labels {
-        *labelled.entry(versions.of(*walk)).or_default() += number;
+        *labelled.entry(versions.version_of(*walk)).or_default() += number;
     }
     let mut all = vec![first(records)];
     all.extend(records.iter().map(VersionSummary::from_record));

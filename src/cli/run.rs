@@ -200,7 +200,7 @@ async fn run(
         return Err(paused_by_alarm(campaign, &store).await?);
     }
     let process = registration::register(&store).await?;
-    say_what_is_idle(campaign, location);
+    warn_about_idle_walkers(campaign, location);
     let (stop, superseded) = (CancellationToken::new(), CancellationToken::new());
     let walks_end = superseded.child_token();
     let run = runtime::RunContext {
@@ -237,7 +237,7 @@ async fn run(
 }
 
 /// Says which walkers will idle, and that labellers must be started.
-fn say_what_is_idle(campaign: &LoadedCampaign, location: &Location) {
+fn warn_about_idle_walkers(campaign: &LoadedCampaign, location: &Location) {
     if let Some(idle) = runtime::idle_walkers(campaign) {
         log_and_warn(format_args!("WARNING: {idle}"));
     }

@@ -129,8 +129,10 @@ fn check_completion(config: &Config) -> Result<(), InvalidValue> {
 
 /// Checks the keys of `[label]` and `[launch]` alone and returns all invalid values.
 pub fn check_label(label: &LabelSection, launch: Option<&LaunchSection>) -> Vec<InvalidValue> {
-    let guard =
-        label.guard.fault().map(|(key, found, expected)| (key.to_owned(), found, expected.to_owned()));
+    let guard = label
+        .guard
+        .invalid_setting()
+        .map(|(key, found, expected)| (key.to_owned(), found, expected.to_owned()));
     let checks = [
         check_pass_environment(label),
         check_batch_options(label),
@@ -143,7 +145,7 @@ pub fn check_label(label: &LabelSection, launch: Option<&LaunchSection>) -> Vec<
 /// Checks the batch system that the configuration describes, and that there is one where labels need it.
 fn check_batch_system(label: &LabelSection, launch: Option<&LaunchSection>) -> Result<(), InvalidValue> {
     match launch.and_then(|launch| launch.custom.as_ref()) {
-        Some(custom) => match custom.fault() {
+        Some(custom) => match custom.invalid_setting() {
             Some((key, found, expected)) => wrong(&format!("launch.custom.{key}"), found, expected),
             None => Ok(()),
         },

@@ -108,7 +108,7 @@ impl Collections {
             for row in &page {
                 let collection = if row.origin == Origin::Biased { &mut biased } else { &mut control };
                 let id = row.block.view().id();
-                let is_of_version = versions.of(id.walk.0) == version;
+                let is_of_version = versions.version_of(id.walk.0) == version;
                 collection.count(row, is_of_version);
                 match (is_of_version, of_both.contains(&id.content)) {
                     (false, _) => {}

@@ -63,11 +63,11 @@ pub async fn run(run: RunContext<'_>, accept: Option<&str>) -> Result<bool, Comm
     }
     let Some(labels) = label_all(run, &check).await? else { return Ok(false) };
     check.compare(&campaign.known, &labels);
-    judge(run, check, accept).await
+    conclude(run, check, accept).await
 }
 
 /// Records and prints the result of a check that is complete.
-async fn judge(
+async fn conclude(
     run: RunContext<'_>,
     mut check: ReferenceCheck,
     accept: Option<&str>,

@@ -140,8 +140,8 @@ fn optional_gauge(text: &mut MetricsText, name: &str, help: &str, value: Option<
     }
 }
 
-fn state_name(standing: ChildState) -> &'static str {
-    match standing {
+fn state_name(state: ChildState) -> &'static str {
+    match state {
         ChildState::Starting => "starting",
         ChildState::Running => "running",
         ChildState::BackingOff { .. } => "backing_off",

@@ -107,7 +107,7 @@ impl WalkVersions {
     }
 
     /// The version of a walk.
-    pub fn of(&self, walk: u32) -> u32 {
+    pub fn version_of(&self, walk: u32) -> u32 {
         let begun = self.starts.partition_point(|(first, _)| *first <= walk);
         self.starts[..begun].last().map_or(0, |(_, version)| *version)
     }
@@ -115,7 +115,7 @@ impl WalkVersions {
     /// The version of the walk of a candidate, from its name ([`wire::CandidateId`]); 0 for another text.
     pub fn of_candidate(&self, name: &str) -> u32 {
         let walk = name.split('-').nth(1).and_then(|place| place.split_once('.'));
-        walk.and_then(|(walk, _)| walk.parse().ok()).map_or(0, |walk| self.of(walk))
+        walk.and_then(|(walk, _)| walk.parse().ok()).map_or(0, |walk| self.version_of(walk))
     }
 
     /// The versions of walks, in order.
@@ -142,7 +142,7 @@ mod tests {
     #[test]
     fn walks_have_the_versions_they_were_created_with() {
         let versions = WalkVersions::from_walks([(0, 0), (1, 0), (2, 1), (3, 1), (4, 3)]);
-        assert_eq!((0..6).map(|walk| versions.of(walk)).collect::<Vec<_>>(), [0, 0, 1, 1, 3, 3]);
+        assert_eq!((0..6).map(|walk| versions.version_of(walk)).collect::<Vec<_>>(), [0, 0, 1, 1, 3, 3]);
         assert_eq!((versions.walks_of(0), versions.walks_of(1)), (0..2, 2..4));
         assert_eq!((versions.walks_of(3), versions.walks_of(2)), (4..i64::MAX, 0..0));
         assert_eq!((versions.newest(), versions.numbers().collect::<Vec<_>>()), (3, vec![0, 1, 3]));

@@ -31,7 +31,8 @@ pub fn logistic_regression(rows: &[Vec<f64>], outcomes: &[bool], penalty: f64) -
     {
         return None;
     }
-    let scales: Vec<Scale> = (0..columns).map(|k| Scale::of(rows.iter().map(|row| row[k]))).collect();
+    let scales: Vec<Scale> =
+        (0..columns).map(|k| Scale::from_values(rows.iter().map(|row| row[k]))).collect();
     let standard = |row: &Vec<f64>| {
         let scaled = row.iter().zip(&scales).map(|(x, scale)| scale.apply(*x));
         [1.0].into_iter().chain(scaled).collect::<Vec<f64>>()
@@ -56,7 +57,7 @@ struct Scale {
 }
 
 impl Scale {
-    fn of(values: impl Iterator<Item = f64> + Clone) -> Self {
+    fn from_values(values: impl Iterator<Item = f64> + Clone) -> Self {
         let number = values.clone().count() as f64;
         let mean = values.clone().sum::<f64>() / number;
         let deviation = (values.map(|x| (x - mean).powi(2)).sum::<f64>() / number).sqrt();

@@ -64,7 +64,7 @@ impl<'a> ArrivedLabels<'a> {
 /// The version of the potential of the walk that found a structure; `None` for an imported one.
 pub(super) fn version_of(arrival: &LabelArrival, versions: &WalkVersions) -> Option<u32> {
     let ExportSource::Candidate { block, .. } = &arrival.row.source else { return None };
-    Some(versions.of(block.view().id().walk.0))
+    Some(versions.version_of(block.view().id().walk.0))
 }
 
 /// What is learned from a structure; `None` for an imported one, which has no grades.

@@ -112,7 +112,7 @@ pub(super) async fn labels(
 ) -> Result<Vec<CandidateLabel>, StoreError> {
     let (mut references, mut labels) = (BTreeMap::new(), Vec::new());
     let version = match model {
-        Some(view) => store.walk_versions().await?.of(view.id().walk.0),
+        Some(view) => store.walk_versions().await?.version_of(view.id().walk.0),
         None => 0,
     };
     for label in store.labels_of(content).await? {

@@ -92,7 +92,7 @@ impl Discovery {
         let of_seed = seed.as_ref().and_then(|seed| shortest_distances(&seed.structure));
         Ok(Self {
             walk: id.walk.0,
-            version: store.walk_versions().await?.of(id.walk.0),
+            version: store.walk_versions().await?.version_of(id.walk.0),
             segment: id.segment,
             step: id.step,
             seed_structure: stored.seed_structure,

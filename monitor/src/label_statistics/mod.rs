@@ -107,7 +107,7 @@ pub async fn read(
         let page = store.finished(protocol, after, PAGE_ROWS).await?;
         let Some(last) = page.last() else { break };
         after = last.decision;
-        let own = page.iter().filter(|candidate| versions.of(candidate.walk) == version);
+        let own = page.iter().filter(|candidate| versions.version_of(candidate.walk) == version);
         own.for_each(|candidate| statistics.finished(candidate, &shared));
     }
     Ok(statistics)
@@ -140,7 +140,7 @@ impl LabelStatistics {
         let view = block.view();
         let errors = view.forces.iter().zip(&row.label.forces);
         let errors: Vec<_> = errors.map(|(model, label)| norm(sub(*model, *label))).collect();
-        let (of, is_shared) = (versions.of(view.id().walk.0), shared.contains(&view.id().content));
+        let (of, is_shared) = (versions.version_of(view.id().walk.0), shared.contains(&view.id().content));
         if of == version {
             let error = self.energies.error_per_atom(&row.structure, view.energy(), row.label.energy);
             self.compared.add(row, is_shared, error);

@@ -73,7 +73,8 @@ impl LabelOrderReader {
         let queued = store.queued_structures(protocol, MAX_QUEUED).await?;
         let costs = CostEstimator::from_store(store, protocol).await?;
         let (mut used, mut covering, mut models) = (HashSet::new(), Vec::new(), HashMap::new());
-        let mut of_queue: BTreeSet<u32> = queued.iter().map(|found| versions.of(found.walk)).collect();
+        let mut of_queue: BTreeSet<u32> =
+            queued.iter().map(|found| versions.version_of(found.walk)).collect();
         of_queue.insert(structures.version);
         for version in of_queue {
             let completion = structures.learn(store, protocol, version, &mut used, &mut covering).await?;
@@ -83,7 +84,7 @@ impl LabelOrderReader {
         let mut rows = Vec::with_capacity(queued.len());
         for found in &queued {
             used.insert(found.decision);
-            let version = versions.of(found.walk);
+            let version = versions.version_of(found.walk);
             let gamma = maximum(&found.original.gamma);
             let known = structures.known(
                 store,
@@ -185,7 +186,7 @@ fn row(
         job: found.job,
         decision: found.decision,
         priority: found.priority,
-        version: versions.of(found.walk),
+        version: versions.version_of(found.walk),
         expected_error: models.calibration.and_then(|found| mean_error(found, &original.gamma_nbr)),
         completion: completion.map(|(model, predictors)| model.probability(predictors)),
         core_hours: costs.predict_job(&size).map(|cost| cost.expected),

@@ -26,7 +26,7 @@ impl Heartbeats {
 
     /// Records that the child is alive.
     pub fn heartbeat(&self, number: u32) {
-        if let Some(sign) = self.sign(number) {
+        if let Some(sign) = self.heartbeat_of(number) {
             let now = u64::try_from(self.now().as_nanos()).unwrap_or(u64::MAX);
             sign.heard.fetch_max(now.max(1), Ordering::Relaxed);
         }
@@ -35,7 +35,7 @@ impl Heartbeats {
     /// Records that the child is alive and has delivered something.
     pub fn delivered(&self, number: u32) {
         self.heartbeat(number);
-        if let Some(sign) = self.sign(number) {
+        if let Some(sign) = self.heartbeat_of(number) {
             sign.delivered.store(true, Ordering::Relaxed);
         }
     }
@@ -61,7 +61,7 @@ impl Heartbeats {
         })
     }
 
-    fn sign(&self, number: u32) -> Option<&Heartbeat> {
+    fn heartbeat_of(&self, number: u32) -> Option<&Heartbeat> {
         self.children.get(usize::try_from(number).ok()?)
     }
 }

@@ -12,8 +12,8 @@ use super::limits::Limits;
 pub(super) enum ChildPhase {
     /// No process; start one at this time.
     Waiting { until: Duration },
-    /// A process with its last heartbeat, or its start time if `yet` is false.
-    Running { heard: Duration, yet: bool },
+    /// A process with its last heartbeat, or its start time if `has_heartbeat` is false.
+    Running { last_heartbeat: Duration, has_heartbeat: bool },
     /// The process was asked to exit.
     Stopping { since: Duration },
     /// The process was killed, with the reason.
@@ -110,7 +110,7 @@ impl Child {
                 self.incarnation += 1;
                 self.restarts += u32::from(self.last_failure.is_some());
                 let start = SupervisorAction::Start { number, incarnation: self.incarnation };
-                (ChildPhase::Running { heard: now, yet: false }, start)
+                (ChildPhase::Running { last_heartbeat: now, has_heartbeat: false }, start)
             }
             ChildPhase::Running { .. } => (
                 ChildPhase::Killed { reason: KillReason::Unresponsive(limits.heartbeat_timeout) },
@@ -134,7 +134,9 @@ impl Child {
     pub fn next_deadline(&self, limits: &Limits) -> Option<Duration> {
         match self.phase {
             ChildPhase::Waiting { until } => Some(until),
-            ChildPhase::Running { heard, .. } => Some(heard.saturating_add(limits.heartbeat_timeout)),
+            ChildPhase::Running { last_heartbeat, .. } => {
+                Some(last_heartbeat.saturating_add(limits.heartbeat_timeout))
+            }
             ChildPhase::Stopping { since } => Some(since.saturating_add(limits.grace_period)),
             ChildPhase::Killed { .. } | ChildPhase::Exited | ChildPhase::Failed => None,
         }
@@ -143,8 +145,8 @@ impl Child {
     pub fn public_state(&self, now: Duration) -> ChildState {
         match self.phase {
             ChildPhase::Waiting { until } => ChildState::BackingOff { left: until.saturating_sub(now) },
-            ChildPhase::Running { yet: false, .. } => ChildState::Starting,
-            ChildPhase::Running { yet: true, .. } => ChildState::Running,
+            ChildPhase::Running { has_heartbeat: false, .. } => ChildState::Starting,
+            ChildPhase::Running { has_heartbeat: true, .. } => ChildState::Running,
             ChildPhase::Stopping { .. } | ChildPhase::Killed { .. } => ChildState::Stopping,
             ChildPhase::Exited => ChildState::Exited,
             ChildPhase::Failed => ChildState::Failed,

@@ -54,7 +54,7 @@ impl Supervisor {
     pub fn adopt(&mut self, number: u32, now: Duration) -> bool {
         match self.child(number) {
             Some(child) if child.is_fresh() => {
-                child.phase = ChildPhase::Running { heard: now, yet: false };
+                child.phase = ChildPhase::Running { last_heartbeat: now, has_heartbeat: false };
                 true
             }
             _ => false,
@@ -64,9 +64,11 @@ impl Supervisor {
     /// Records a heartbeat.
     pub fn heartbeat(&mut self, number: u32, now: Duration) {
         // Late heartbeats of a process that is dead or being killed mean nothing.
-        if let Some(ChildPhase::Running { heard, yet }) = self.child(number).map(|child| &mut child.phase) {
-            *heard = now.max(*heard);
-            *yet = true;
+        if let Some(ChildPhase::Running { last_heartbeat, has_heartbeat }) =
+            self.child(number).map(|child| &mut child.phase)
+        {
+            *last_heartbeat = now.max(*last_heartbeat);
+            *has_heartbeat = true;
         }
     }
 
@@ -150,8 +152,8 @@ impl Supervisor {
 
     fn reset_heartbeats(&mut self, now: Duration) {
         for child in &mut self.children {
-            if let ChildPhase::Running { heard, .. } = &mut child.phase {
-                *heard = now;
+            if let ChildPhase::Running { last_heartbeat, .. } = &mut child.phase {
+                *last_heartbeat = now;
             }
         }
     }

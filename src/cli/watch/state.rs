@@ -173,7 +173,7 @@ impl WatchState {
         let version = |walk: &store::WalkStatus| walk.conditions.as_ref().map_or(0, |found| found.version);
         let versions = WalkVersions::from_walks(walks.iter().map(|walk| (walk.walk, version(walk))));
         let is_newest = |decision: &&RecentDecision| {
-            decision.walk.is_none_or(|walk| versions.of(walk) == versions.newest())
+            decision.walk.is_none_or(|walk| versions.version_of(walk) == versions.newest())
         };
         // γ of different versions of the potential cannot be compared.
         self.charts = Charts::from_decisions(self.decisions.iter().filter(is_newest));

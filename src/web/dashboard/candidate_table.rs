@@ -64,7 +64,7 @@ pub async fn page(State(dashboard): State<Dashboard>, RawQuery(query): RawQuery)
         None => None,
     };
     let versions = dashboard.store.walk_versions().await?;
-    let of_rows = || rows.iter().map(|row| versions.of(row.walk)).collect::<Vec<_>>();
+    let of_rows = || rows.iter().map(|row| versions.version_of(row.walk)).collect::<Vec<_>>();
     let versions = (!versions.is_single()).then(of_rows);
     json(&json!({
         "candidates": rows, "versions": versions, "next": next, "scanned": scanned, "imported": imported,

@@ -87,7 +87,7 @@ impl Store {
         let Some(own) = own else { return Ok(None) };
         let (Some(energy), Some(features)) = (own.energy, own.features) else { return Ok(None) };
         let versions = walk_conditions::versions(&mut transaction).await?;
-        let walks = versions.walks_of(versions.of(own.walk));
+        let walks = versions.walks_of(versions.version_of(own.walk));
         let near = query(NEAR).bind(own.formula).bind(own.decision).bind(energy).bind(protocol).bind(limit);
         let near = near.bind(walks.start).bind(walks.end);
         let near: Vec<Near> = near.fetch_all(&mut transaction).await?;

@@ -319,7 +319,9 @@ impl Store {
         match (exact, found.as_slice()) {
             (Some(k), _) => Ok((found[k].1, found.swap_remove(k).0)),
             (None, [(candidate, job)]) => Ok((*job, candidate.clone())),
-            (None, []) => Err(StoreError::UnknownJob { id: id.into(), near: self.near(campaign, id).await? }),
+            (None, []) => {
+                Err(StoreError::UnknownJob { id: id.into(), near: self.similar_ids(campaign, id).await? })
+            }
             (None, _) => {
                 let matches = found.into_iter().map(|(candidate, _)| candidate).collect();
                 Err(StoreError::AmbiguousJob { id: id.into(), matches })
@@ -333,7 +335,7 @@ impl Store {
     }
 
     /// Candidates whose names share the longest prefix with `id`.
-    async fn near(&self, campaign: &str, id: &str) -> Result<Vec<String>> {
+    async fn similar_ids(&self, campaign: &str, id: &str) -> Result<Vec<String>> {
         let full = if id.starts_with(campaign) { id.to_owned() } else { format!("{campaign}-{id}") };
         for (end, _) in full.char_indices().rev() {
             let found = self.jobs_with_prefix(&full[..end]).await?;

@@ -52,7 +52,7 @@ impl CalculationHandle {
             Self::Custom(job) => match &batch.custom {
                 Some(custom) => custom.inspect(job).await,
                 // The configuration has another batch system now.
-                None => Ok(custom_jobs::look(job).unwrap_or(CalculationState::Elsewhere)),
+                None => Ok(custom_jobs::poll_directory(job).unwrap_or(CalculationState::Elsewhere)),
             },
         }
     }

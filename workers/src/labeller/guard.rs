@@ -67,7 +67,7 @@ pub struct LabelGuard {
 
 impl LabelGuard {
     /// The first key with an invalid value, with that value and the expected one.
-    pub fn fault(&self) -> Option<(&'static str, String, &'static str)> {
+    pub fn invalid_setting(&self) -> Option<(&'static str, String, &'static str)> {
         let positive = |x: &f64| x.is_finite() && *x > 0.0;
         if let Some((pair, bond)) = self.min_bond_lengths.iter().find(|(_, bond)| !positive(bond)) {
             return Some(("label.guard.min_bond_lengths", format!("{pair} = {bond}"), "a length above 0, Å"));

@@ -74,7 +74,7 @@ pub struct LogTexts {
 
 impl CustomScheduler {
     /// The first value that makes no sense: its key below `launch.custom`, what was found and what was expected.
-    pub fn fault(&self) -> Option<(&'static str, String, String)> {
+    pub fn invalid_setting(&self) -> Option<(&'static str, String, String)> {
         let expected = |text: &str| text.to_owned();
         if self.name.trim().is_empty() {
             return Some((
@@ -103,11 +103,11 @@ impl CustomScheduler {
         if let Err(fault) = self.submit_command("1", Some("1")) {
             return Some(("submit", fault.place(&self.submit), fault.expected()));
         }
-        self.fault_of_answers().or_else(|| self.fault_of_script())
+        self.invalid_answers().or_else(|| self.invalid_script())
     }
 
     /// The same for the words that the commands print.
-    fn fault_of_answers(&self) -> Option<(&'static str, String, String)> {
+    fn invalid_answers(&self) -> Option<(&'static str, String, String)> {
         let mut seen = BTreeSet::new();
         for (key, words) in self.states.lists() {
             for word in words {
@@ -137,7 +137,7 @@ impl CustomScheduler {
         self.vanished.is_empty().then(|| ("vanished", "an empty list".to_owned(), expected.to_owned()))
     }
 
-    fn fault_of_script(&self) -> Option<(&'static str, String, String)> {
+    fn invalid_script(&self) -> Option<(&'static str, String, String)> {
         if !self.script.contains("{command}") {
             let expected = "a script with {command}, what the job runs";
             return Some(("script", "a script without it".to_owned(), expected.to_owned()));

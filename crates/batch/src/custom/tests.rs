@@ -95,7 +95,7 @@ impl StandIn {
 #[test]
 fn the_examples_have_no_fault() {
     for name in EXAMPLES {
-        assert_eq!(example(name).fault(), None, "{name}");
+        assert_eq!(example(name).invalid_setting(), None, "{name}");
     }
 }
 
@@ -226,7 +226,7 @@ fn faults_of_a_configuration_name_their_key() {
     let changed = |change: &dyn Fn(&mut CustomScheduler)| {
         let mut scheduler = example("pbs");
         change(&mut scheduler);
-        let (key, found, expected) = scheduler.fault().expect("a fault");
+        let (key, found, expected) = scheduler.invalid_setting().expect("a fault");
         (key, format!("{found}; expected {expected}"))
     };
     type Change = fn(&mut CustomScheduler);

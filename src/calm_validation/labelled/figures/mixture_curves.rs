@@ -50,7 +50,7 @@ pub fn draw(mixtures: &[ComparedMixture], report: &LabelledReport) -> Option<Fig
 impl<'a> MixtureCurves<'a> {
     fn new(mixtures: &'a [ComparedMixture], report: &'a LabelledReport) -> Self {
         let places = MixturePlaces::new(mixtures);
-        let mut found: Vec<_> = mixtures.iter().map(|mixture| places.of(mixture)).collect();
+        let mut found: Vec<_> = mixtures.iter().map(|mixture| places.position(mixture)).collect();
         found.sort_unstable();
         found.dedup();
         Self { mixtures, report, is_unique: found.len() == mixtures.len(), places }
@@ -117,7 +117,7 @@ impl<'a> MixtureCurves<'a> {
 
     /// One colour for each number of components, or for each mixture if that does not tell them apart.
     fn stroke_number(&self, k: usize, mixture: &ComparedMixture) -> usize {
-        let column = self.places.of(mixture).map(|(column, _)| column);
+        let column = self.places.position(mixture).map(|(column, _)| column);
         column.filter(|_| self.is_unique).unwrap_or(k)
     }
 

@@ -43,7 +43,7 @@ impl MixturePlaces {
     }
 
     /// Column and row of a mixture.
-    pub fn of(&self, mixture: &ComparedMixture) -> Option<(usize, usize)> {
+    pub fn position(&self, mixture: &ComparedMixture) -> Option<(usize, usize)> {
         let column = self.columns.iter().position(|components| *components == mixture.components)?;
         Some((column, self.rows.iter().position(|dimension| *dimension == mixture.dimension)?))
     }
@@ -116,7 +116,7 @@ fn draw_cell(
     [contamination, retention]: [Option<f64>; 2],
     unfiltered: Option<f64>,
 ) {
-    let Some((x, y)) = places.of(mixture).map(|(x, y)| (x as f64, y as f64)) else { return };
+    let Some((x, y)) = places.position(mixture).map(|(x, y)| (x as f64, y as f64)) else { return };
     let share = contamination.zip(unfiltered.filter(|all| *all > 0.0)).map_or(0.0, |(of, all)| of / all);
     let paint: Paint = Colour::VERMILLION.faint(0.8 * share.clamp(0.0, 1.0));
     panel.bar([x, y], [x + 1.0, y + 1.0], paint);
@@ -142,7 +142,7 @@ mod tests {
         let mixtures = [mixture(8, &[8, 4]), mixture(4, &[8, 2]), mixture(8, &[4, 8]), mixture(8, &[16, 1])];
         let places = MixturePlaces::new(&mixtures);
         assert_eq!(places.components, ["2–8", "4–8", "4–8", "1–16"]);
-        let found = mixtures.each_ref().map(|mixture| places.of(mixture));
+        let found = mixtures.each_ref().map(|mixture| places.position(mixture));
         assert_eq!(found, [Some((2, 1)), Some((0, 0)), Some((1, 1)), Some((3, 1))]);
     }
 }

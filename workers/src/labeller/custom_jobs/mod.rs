@@ -107,7 +107,7 @@ impl CustomJobs {
     }
 
     pub async fn inspect(&self, job: &CustomJob) -> Result<CalculationState, StoreError> {
-        if let Some(known) = look(job) {
+        if let Some(known) = poll_directory(job) {
             return Ok(known);
         }
         if job.scheduler != self.client.scheduler().name {
@@ -223,7 +223,7 @@ impl CustomJobs {
 }
 
 /// What can be said without the batch system.
-pub(super) fn look(job: &CustomJob) -> Option<CalculationState> {
+pub(super) fn poll_directory(job: &CustomJob) -> Option<CalculationState> {
     let exists = job.directory.symlink_metadata().is_ok();
     if exists && !private_directory::is_own(&job.directory) {
         // Another user has created a directory of that name after it was removed, or has submitted the job.

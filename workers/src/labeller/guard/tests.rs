@@ -32,7 +32,7 @@ fn refused(guard_text: &str, structure: &Structure) -> bool {
 fn unset_limits_reject_nothing() {
     assert_eq!(LabelGuard::default().rejects(&box_of(0.5, 100.0, 3.0)), None);
     assert_eq!(guard("{}"), LabelGuard::default());
-    assert_eq!(LabelGuard::default().fault(), None);
+    assert_eq!(LabelGuard::default().invalid_setting(), None);
 }
 
 #[test]
@@ -91,7 +91,7 @@ fn impossible_limits_are_rejected() {
         (r#"{ "duplicate_tolerance": 1.5 }"#, "label.guard.duplicate_tolerance"),
         (r#"{ "max_cost": 0 }"#, "label.guard.max_cost"),
     ] {
-        assert_eq!(guard(text).fault().unwrap().0, key);
+        assert_eq!(guard(text).invalid_setting().unwrap().0, key);
     }
 }
 
