@@ -244,8 +244,8 @@ fn wrong_launches_name_key_and_remedy() {
         said.contains("--partition is for --on slurm") && said.contains("launch.custom.script"),
         "{said}"
     );
-    let said = refused(&["--agents=0", "--time=2h"]);
-    assert!(said.contains("--time 2h: expected minutes"), "{said}");
+    let said = refused(&["--agents=0", "--time=2"]);
+    assert!(said.contains("expected a time with its unit, such as 24h"), "{said}");
     let said = refused(&["--resubmit"]);
     assert!(said.contains("CALMWALK_JOB"), "{said}");
     let path = campaign.directory().join("campaign.toml");

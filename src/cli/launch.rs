@@ -19,6 +19,7 @@ use orchestrator::batch::{
 use store::Location;
 
 use self::job_specs::JobSpecs;
+use self::time_limit::TimeLimit;
 use super::{CommandError, ExitStatus, block_on, campaign_location};
 use crate::campaign::LoadedCampaign;
 use crate::config::Config;
@@ -73,9 +74,9 @@ pub struct LaunchArgs {
     /// Memory of each job, GB [default: that of the batch system]
     #[arg(long, value_name = "GB", value_parser = bytes)]
     memory: Option<u64>,
-    /// Time limit of each job in the format of sbatch, such as 24:00:00 [default: that of the partition]
+    /// Time limit of each job, such as 24h or 24:00:00 [default: that of the partition]
     #[arg(long, value_name = "TIME")]
-    time: Option<String>,
+    time: Option<TimeLimit>,
     /// Partition of the jobs [default: that of the batch system]
     #[arg(long, value_name = "NAME")]
     partition: Option<String>,

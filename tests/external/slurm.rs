@@ -334,7 +334,7 @@ fn a_job_is_signalled_before_its_time_limit_and_requeued() {
         let text = fs::read_to_string(common::config(&format!("slurm/{name}"))).unwrap();
         fs::write(site.join(name), text.replace("TERM@120", "TERM@59")).unwrap();
     }
-    campaign.options.splice(1..1, ["--time=1".into(), format!("--template={}", site.display())]);
+    campaign.options.splice(1..1, ["--time=1m".into(), format!("--template={}", site.display())]);
     campaign.launched();
     let orchestrator = campaign.job("orchestrator").id;
     wait_until("the job is signalled and requeued", || restarts(&orchestrator) == 1);

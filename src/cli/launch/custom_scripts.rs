@@ -9,7 +9,6 @@ use super::LaunchArgs;
 use super::commands::{JobCommands, text};
 use super::cores_of_jobs::CoresOfJobs;
 use super::templates::fill;
-use super::time_limit::time_limit;
 use crate::exit_status::CommandError;
 
 /// What each job runs.
@@ -53,7 +52,7 @@ impl CustomScripts<'_> {
                 cores: u32::try_from(cores).unwrap_or(u32::MAX),
                 gpus,
                 memory: self.launch.memory,
-                time_limit: self.time_limit()?,
+                time_limit: self.time_limit(),
                 directory: self.directory.to_owned(),
                 output: self.folder.join(format!("{}.out", role.name())),
                 command: format!("bash {}", quoted(&text(&self.folder.join(&name))?)),
@@ -64,13 +63,13 @@ impl CustomScripts<'_> {
         Ok(scripts)
     }
 
-    fn time_limit(&self) -> Result<Option<Duration>, CommandError> {
-        self.launch.time.as_deref().map(time_limit).transpose()
+    fn time_limit(&self) -> Option<Duration> {
+        self.launch.time.map(|limit| limit.0)
     }
 
     /// What a job runs.
     fn run_script(&self, role: Role, command: &str) -> Result<String, CommandError> {
-        let limit = self.time_limit()?.map_or(0, |limit| {
+        let limit = self.time_limit().map_or(0, |limit| {
             // Half of a very short one.
             limit.saturating_sub(MARGIN).max(limit / 2).as_secs().max(1)
         });

@@ -232,12 +232,9 @@ fn slurm_scripts(
 /// Options of `sbatch` for every job.
 fn options(launch: &LaunchArgs) -> Vec<String> {
     let memory = launch.memory.map(|bytes| format!("{}M", bytes.div_ceil(MEBIBYTE)));
-    let named = [
-        ("time", &launch.time),
-        ("partition", &launch.partition),
-        ("account", &launch.account),
-        ("mem", &memory),
-    ];
+    let time = launch.time.map(|limit| limit.to_string());
+    let named =
+        [("time", &time), ("partition", &launch.partition), ("account", &launch.account), ("mem", &memory)];
     let named = named.iter().filter_map(|(name, value)| Some(format!("--{name}={}", value.as_ref()?)));
     named.chain(launch.options.iter().cloned()).collect()
 }

@@ -1,20 +1,38 @@
-//! Time limits in the format of `sbatch`.
+//! Time limits of jobs.
 
+use std::fmt;
+use std::str::FromStr;
 use std::time::Duration;
 
-use crate::exit_status::CommandError;
+use crate::duration;
 
-/// Parses `minutes`, `minutes:seconds`, `hours:minutes:seconds`, `days-hours`, `days-hours:minutes` or
-/// `days-hours:minutes:seconds`.
-///
-/// # Errors
-/// Another text.
-pub fn time_limit(text: &str) -> Result<Duration, CommandError> {
-    seconds(text).filter(|seconds| *seconds > 0).map(Duration::from_secs).ok_or_else(|| {
-        CommandError::Input(format!(
-            "--time {text}: expected minutes, hours:minutes:seconds or days-hours:minutes:seconds, such as 24:00:00"
-        ))
-    })
+/// The time limit of a job: `"24h"`, or in a format of `sbatch` that says its units.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TimeLimit(pub Duration);
+
+impl FromStr for TimeLimit {
+    type Err = String;
+
+    /// Parses a time with its unit, `minutes:seconds`, `hours:minutes:seconds`, `days-hours`, `days-hours:minutes` or `days-hours:minutes:seconds`.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let found = match text.contains([':', '-']) {
+            true => seconds(text).map(Duration::from_secs),
+            false => text.parse::<duration::Duration>().ok().map(duration::Duration::get),
+        };
+        found.filter(|limit| !limit.is_zero()).map(Self).ok_or_else(|| {
+            "expected a time with its unit, such as 24h, or hours:minutes:seconds, such as 24:00:00"
+                .to_owned()
+        })
+    }
+}
+
+/// As `sbatch` takes it, `days-hours:minutes:seconds`. A part of a second counts as a whole one.
+impl fmt::Display for TimeLimit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let seconds = self.0.as_secs() + u64::from(self.0.subsec_nanos() > 0);
+        let (days, rest) = (seconds / 86_400, seconds % 86_400);
+        write!(f, "{days}-{:02}:{:02}:{:02}", rest / 3600, rest / 60 % 60, rest % 60)
+    }
 }
 
 fn seconds(text: &str) -> Option<u64> {
@@ -24,7 +42,6 @@ fn seconds(text: &str) -> Option<u64> {
     };
     let parts = rest.split(':').map(number).collect::<Option<Vec<_>>>()?;
     let of_day = match (&parts[..], days) {
-        ([minutes], None) => minutes.checked_mul(60)?,
         ([minutes, seconds], None) => minutes.checked_mul(60)?.checked_add(*seconds)?,
         ([hours], Some(_)) => hours.checked_mul(3600)?,
         ([hours, minutes], Some(_)) => hours.checked_mul(3600)?.checked_add(minutes * 60)?,
@@ -47,24 +64,28 @@ mod tests {
     use super::*;
 
     #[test]
-    fn time_limits_are_read_as_sbatch_reads_them() {
+    fn time_limits_have_units_or_the_format_of_sbatch() {
         for (text, expected) in [
-            ("90", Some(5400)),
-            ("1:30", Some(90)),
-            ("24:00:00", Some(86_400)),
-            ("1-2", Some(93_600)),
-            ("1-02:03", Some(93_780)),
-            ("1-02:03:04", Some(93_784)),
-            ("0", Some(0)),
+            ("90m", Some((5400, "0-01:30:00"))),
+            ("1day 2h", Some((93_600, "1-02:00:00"))),
+            ("1:30", Some((90, "0-00:01:30"))),
+            ("24:00:00", Some((86_400, "1-00:00:00"))),
+            ("1-2", Some((93_600, "1-02:00:00"))),
+            ("1-02:03", Some((93_780, "1-02:03:00"))),
+            ("1-02:03:04", Some((93_784, "1-02:03:04"))),
+            ("90", None),
+            ("0", None),
+            ("0:00", None),
             ("", None),
             ("1:2:3:4", None),
             ("+5", None),
-            ("2h", None),
             ("1-", None),
-            ("9999999999", None),
+            ("9999999999:00", None),
         ] {
-            assert_eq!(seconds(text), expected, "{text}");
+            let found = text.parse::<TimeLimit>().ok();
+            let expected =
+                expected.map(|(seconds, written)| (Duration::from_secs(seconds), written.to_owned()));
+            assert_eq!(found.map(|limit| (limit.0, limit.to_string())), expected, "{text}");
         }
-        assert!(time_limit("0").is_err());
     }
 }
