@@ -48,8 +48,8 @@ pub struct LaunchArgs {
     /// Accept CONFIG for a campaign that was started with another configuration file (calmwalk refuses it otherwise)
     #[arg(long)]
     adopt: bool,
-    /// As `calmwalk run --accept-reference-check`, for the check as it is now; if the protocol, the structures or the bounds
-    /// change later, it must pass again
+    /// Start walks although the current reference check failed (see `calmwalk run --help`). If protocol, structures or bounds change, the
+    /// check must pass again
     #[arg(long)]
     accept_reference_check: bool,
     /// Number of agents, one per job

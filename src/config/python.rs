@@ -40,7 +40,7 @@ pub struct PythonSection {
     /// Time after which a call that has no answer counts as failed: the program is started again.
     #[serde(default = "defaults::python_timeout")]
     pub timeout: Duration,
-    /// The same for the start, and for the first calls of each size, for which frameworks compile.
+    /// Time limit for the start, and for the first call of each size, which frameworks compile.
     #[serde(default = "defaults::compile_timeout")]
     pub compile_timeout: Duration,
     /// Directory in which frameworks keep compiled programs for the next start, and calmwalk the size of batches that the memory of the

@@ -27,7 +27,7 @@ pub struct WalkSection {
     /// Time step, fs. Default: 2 fs, or 0.5 fs with H, He, Li or Be.
     #[serde(default)]
     pub time_step: Option<Positive>,
-    /// Thermostat: Langevin or Nosé–Hoover.
+    /// Thermostat: Langevin, Nosé–Hoover or velocity rescaling.
     #[serde(default = "defaults::thermostat")]
     #[schemars(transform = schema::without_none)]
     pub thermostat: ThermostatSettings,
@@ -67,7 +67,7 @@ pub struct WalkSection {
 pub struct WalkGroupSection {
     /// Name, by which views and filters select the walks of the group.
     pub name: String,
-    /// Filter of the seed structures that the group walks from, by `atoms`, `element` and `seed`. Default: all.
+    /// Filter of the seed structures that the group walks from, by `atoms`, `element` and `seed_structure`. Default: all.
     #[serde(default)]
     pub seed_structures: Option<String>,
     /// Temperatures of the thermostat, K. Default: `walk.temperature`.

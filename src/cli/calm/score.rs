@@ -84,9 +84,9 @@ pub struct CalmScoreArgs {
     /// atom of the model and of the label (eV), mean and largest force error (eV/Å)
     #[arg(long, value_name = "FILE.csv")]
     table: Option<PathBuf>,
-    /// Also write force_error_bound (eV/Å) of each structure: what 90 % of the force errors of its worst atom, that with the largest
-    /// gamma_nbr, are expected to be below, from the labels of this campaign, or of a file that `calmwalk force-errors
-    /// --calibration` wrote. Model and artifact must be those of a version of its potential
+    /// Also write force_error_bound (eV/Å) of each structure: 90 % of the force errors of its worst atom (largest gamma_nbr) are expected
+    /// to be below it. calmwalk learns it from the labels of this campaign, or reads it from a file of `calmwalk force-errors
+    /// --calibration`. Model and artifact must be those of a version of the campaign's potential
     #[arg(long, value_name = "DIR|FILE.json")]
     calibration: Option<PathBuf>,
 }

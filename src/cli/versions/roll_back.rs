@@ -31,12 +31,12 @@ const CANDIDATES: u32 = 16;
 
 /// Go back to an earlier version: register its files as a new version
 ///
-/// Nothing is deleted: the version with the model of N gets the next number, and later refits train it further. Its mixture is that
-/// of N, updated with the structures that the campaign has accepted since N's training set was fixed, so that walks do not find
-/// them again. Labels, decisions and other versions stay.
+/// Registers the model of N under the next number; later refits train it further. Updates the mixture of N with the structures that the
+/// campaign has accepted since N's training set was fixed, so that walks do not find them again. Labels, decisions and other versions
+/// stay.
 ///
-/// A reproducible campaign must not be running. The next calmwalk run takes the version up, and starts every walk of its plan anew.
-/// A running live campaign takes it up within seconds.
+/// A reproducible campaign must not be running: the next calmwalk run switches to the version and restarts all walks from their seed
+/// structures. A running live campaign switches within seconds.
 #[derive(Debug, clap::Args)]
 pub struct VersionsRollBackArgs {
     /// Number of the version to go back to; 0 is that of the configuration
