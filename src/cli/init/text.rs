@@ -16,9 +16,9 @@ const BIASED_STEPS: u64 = 15_000;
 
 /// What closes the loop, for users who have labelled structures that the potential knows.
 const REFIT: &str =
-    "# [refit]                       # train the potential from the labels, and go on with it (docs/refit.md)
+    "# [refit]                       # train the potential from the labels, and continue with it (docs/refit.md)
 # replay = [\"train.extxyz\"]     # labelled structures that it knows: its training data, or a sample of them
-# after_structures = 50         # train when so many more structures are accepted";
+# after_structures = 50         # train when this many more structures are accepted";
 
 /// The text of the configuration in `directory`.
 ///
