@@ -47,7 +47,7 @@ pub struct WalkSection {
     /// Bias on the cell of walks with a barostat. Default: none.
     #[serde(default)]
     pub cell_bias: Option<CellBiasSection>,
-    /// Whether the energy that an update of the mixture gives to a biased walk is taken out of its kinetic energy again.
+    /// Whether calmwalk removes the energy that an update of the mixture gives to a biased walk from its kinetic energy.
     #[serde(default)]
     pub remove_update_work: bool,
     /// Number of steps over which the norms in τ_r are averaged.
@@ -82,13 +82,13 @@ pub struct WalkGroupSection {
     /// V/V₀ at which walks at constant pressure start. Default: `walk.start_volume`.
     #[serde(default)]
     pub start_volumes: Vec<Positive>,
-    /// Whether the cell of walks at constant pressure is biased. Default: if there is a table `walk.cell_bias`.
+    /// Whether the cell of walks at constant pressure is biased. Default: true if there is a table `walk.cell_bias`.
     #[serde(default)]
     pub cell_bias: Option<bool>,
     /// Scales τ of the uncertainty force. Default: `walk.tau`.
     #[serde(default)]
     pub tau_values: Vec<Positive>,
-    /// Number of walks under each combination of conditions, which differ in their random numbers.
+    /// Number of walks under each combination of conditions; they differ in their random numbers.
     #[serde(default = "defaults::repeats")]
     pub repeats: NonZeroU32,
 }
