@@ -96,7 +96,7 @@ fn campaign(mode: &str) -> TempDir {
     directory
 }
 
-/// Version 1, which is in force; version 2, which was refused; version 3, which is not taken up yet.
+/// Version 1, which is in force; version 2, which was refused; version 3, which no walk uses yet.
 fn three_versions(mode: &str) -> TempDir {
     let directory = campaign(mode);
     on_store(directory.path(), async |store| {

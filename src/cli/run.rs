@@ -399,7 +399,7 @@ async fn warn_if_disk_is_too_small(
     Ok(())
 }
 
-/// Why the campaign does not go on, and how it does.
+/// Why the campaign does not continue, and what makes it continue.
 async fn paused_by_alarm(campaign: &LoadedCampaign, store: &Store) -> Result<CommandError, CommandError> {
     let values = MixtureValues(store.values().await?).training_frames();
     let measured = ForgettingMeasurement::deserialize(values).map_err(CommandError::failed)?;

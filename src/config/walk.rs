@@ -123,7 +123,7 @@ pub struct CellBiasSection {
     pub volume_range: [Positive; 2],
     /// Number of collected structures after which a walk can end at a boundary of the volume.
     pub end_after_collected: u32,
-    /// Number of contacts with a boundary within a window after which such a walk ends.
+    /// Number of contacts with a boundary, within `window` steps, after which such a walk ends.
     pub end_after_contacts: NonZeroU32,
 }
 

@@ -1,7 +1,7 @@
 //! A refit: trains a new version of the potential from the labels of a campaign, builds its mixture, judges it, and registers or
 //! refuses it.
 //!
-//! Each step leaves files in a directory of the refit, and is skipped if they are there. A refit that was killed goes on from them, to
+//! Each step leaves files in a directory of the refit, and is skipped if they are there. A refit that was killed continues from them, to
 //! the same bytes.
 
 mod command;

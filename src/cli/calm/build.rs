@@ -183,7 +183,7 @@ fn end_part(pass: u8, part: BuildPart, done: bool) -> Result<ExitStatus, Command
     Ok(ExitStatus::Done)
 }
 
-/// Says that the build goes on later.
+/// Says how to continue the build.
 pub(super) fn stopped() -> ExitStatus {
     print_stderr("stopped; the same command continues");
     ExitStatus::Interrupted

@@ -236,7 +236,7 @@ fn full_text(template: &str, mut sections: Vec<WrittenSection>) -> String {
 fn filled(block: &str, mut keys: Vec<WrittenKey>) -> String {
     let (mut lines, mut is_replaced) = (Vec::new(), false);
     for line in block.lines() {
-        // The comment of the line above goes on.
+        // The comment of the line above continues.
         if line.starts_with("   ") {
             if !is_replaced {
                 lines.push(line.to_owned());

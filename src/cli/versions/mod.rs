@@ -68,7 +68,7 @@ fn read<T>(
 struct KnownVersions {
     /// Those from 1 on and refused attempts, by number.
     versions: Vec<VersionRecord>,
-    /// Number of the version that the decision log has taken up.
+    /// Number of the version that the decision log last switched to.
     taken_up: u32,
 }
 
