@@ -225,7 +225,7 @@ fn an_earlier_version_is_registered_again() {
     assert!(refuse(here, ["versions", "here", "roll-back", "1"]).contains("is being run by"));
     drop(lock);
     let said = succeed(here, ["versions", "here", "roll-back", "1"]);
-    let expected = "registered version 4: version 1 again\nthe next calmwalk run starts every walk of the plan anew with it\n";
+    let expected = "registered version 4: version 1 again\nthe next calmwalk run restarts all walks from their seed structures with it\n";
     assert_eq!(said, expected);
     let (versions, files) = on_store(here, async |store| {
         (store.versions().await.unwrap(), store.version_files(4).await.unwrap().unwrap())
@@ -247,7 +247,9 @@ fn a_running_live_campaign_may_go_back() {
     let _lock = CampaignLock::acquire(&here.join("here"), "calmwalk run").unwrap();
     let said = succeed(here, ["versions", "here", "roll-back", "0"]);
     assert!(
-        said.starts_with("registered version 4: version 0 again\nevery walk of the plan starts anew"),
+        said.starts_with(
+            "registered version 4: version 0 again\nall walks restart from their seed structures"
+        ),
         "{said}"
     );
     assert_eq!(on_store(here, async |store| store.version_files(4).await.unwrap()), Some(real_files()));

@@ -39,7 +39,7 @@ const CANDIDATES: u32 = 16;
 /// structures. A running live campaign switches within seconds.
 #[derive(Debug, clap::Args)]
 pub struct VersionsRollBackArgs {
-    /// Number of the version to go back to; 0 is that of the configuration
+    /// Number of the version to go back to; 0 is the potential of the configuration
     #[arg(value_name = "N")]
     number: u32,
     #[command(flatten)]
@@ -221,12 +221,12 @@ impl RolledBack {
         }
         match mode {
             CampaignMode::Reproducible => {
-                writeln!(out, "the next calmwalk run starts every walk of the plan anew with it")
+                writeln!(out, "the next calmwalk run restarts all walks from their seed structures with it")
             }
             CampaignMode::Live => {
                 writeln!(
                     out,
-                    "every walk of the plan starts anew with it: at once if the campaign runs, else at the next calmwalk run"
+                    "all walks restart from their seed structures with it: at once if the campaign runs, else at the next calmwalk run"
                 )
             }
         }
