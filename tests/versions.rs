@@ -287,7 +287,7 @@ fn walks_do_not_find_again_what_they_found_before_the_campaign_went_back() {
     assert_eq!(before["found"]["candidates"]["accepted"], accepted);
 
     let message = refuse(here, ["refit", "here"]);
-    assert!(message.contains("there is no section [refit]") && message.contains("replay = "), "{message}");
+    assert!(message.contains("has no section [refit]") && message.contains("replay = "), "{message}");
 }
 
 /// Writes a configuration with a training program that fails, and starts it. Returns when a walk has begun.

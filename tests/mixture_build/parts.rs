@@ -81,7 +81,7 @@ fn parts_that_are_missing_killed_or_of_another_build_are_noticed() {
     let held = PausedProcesses::new([running.0.id()]);
     let message = fail(here, &part("out.npz", 1, 1, 2));
     assert!(message.contains("another process is building out.npz"), "{message}");
-    assert!(fail(here, &arguments("out.npz", &["data.extxyz"], &[])).contains("another process builds"));
+    assert!(fail(here, &arguments("out.npz", &["data.extxyz"], &[])).contains("another process is building"));
     succeed(here, part("out.npz", 1, 2, 2));
     // This kills the part.
     drop(held);
