@@ -58,8 +58,8 @@ impl RefitSchedule {
             false => ("refit.max_versions", "raise"),
         };
         Some(format!(
-            "no walk starts: the campaign ended with version {}, the last one by {key}; {change} {key} to start all walks of the plan \
-             with that version (raised limits of walks alone start none)",
+            "no walk starts: the campaign ended with version {}, the last one by {key}; {change} {key} to start all planned walks \
+             with that version (raising limits of walks alone starts none)",
             newest.number
         ))
     }
