@@ -189,9 +189,7 @@ fn prepare_directory(campaign: &Path, number: u32, protocol: &str) -> Result<Pat
     let before: Option<FrozenSet> =
         fs::read(directory.join("set.json")).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
     if before.is_some_and(|before| before.protocol != protocol) {
-        log_and_warn(format_args!(
-            "refit {number}: starts again, because the label protocol has changed"
-        ));
+        log_and_warn(format_args!("refit {number}: starts again, because the label protocol has changed"));
         fs::remove_dir_all(&directory).map_err(|error| cannot_write(&directory, error))?;
     }
     fs::create_dir_all(&directory).map_err(|error| cannot_write(&directory, error))?;
