@@ -195,7 +195,7 @@ fn an_exported_version_has_the_bytes_of_the_store_and_replaces_nothing() {
 
     fs::remove_file(here.join("out/1/kokkos.npz")).unwrap();
     let said = succeed(here, export);
-    assert!(said.starts_with("wrote out/1/kokkos.npz\nout/1/gmm_artifacts.npz is there already"), "{said}");
+    assert!(said.starts_with("wrote out/1/kokkos.npz\nout/1/gmm_artifacts.npz already exists"), "{said}");
     fs::remove_file(here.join("out/1/kokkos.npz")).unwrap();
     fs::write(here.join("out/1/gmm_artifacts.npz"), "another").unwrap();
     let message = refuse(here, export);

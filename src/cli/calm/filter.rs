@@ -18,7 +18,7 @@ const RESOLUTION: f64 = 300.0;
 /// Compare structures below a threshold of the grade with random subsets
 ///
 /// For each threshold, shows how many structures have at most this grade, and their mean absolute error. With --class-threshold, also
-/// shows precision, recall and F1 for a class, such as the stable structures of Matbench Discovery. Beside each number stand mean and
+/// shows precision, recall and F1 for a class, such as the stable structures of Matbench Discovery. Beside each number are mean and
 /// standard deviation over random subsets of the same size. If the grade predicts errors, the structures below the threshold have
 /// smaller errors than these subsets.
 ///

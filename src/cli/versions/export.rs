@@ -52,7 +52,7 @@ impl VersionsExportArgs {
             print(|out| {
                 outputs.iter().zip(written).try_for_each(|((path, _), written)| match written {
                     true => writeln!(out, "wrote {}", path.display()),
-                    false => writeln!(out, "{} is there already, with the same content", path.display()),
+                    false => writeln!(out, "{} already exists with the same content", path.display()),
                 })
             })?;
         }
