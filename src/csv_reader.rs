@@ -99,7 +99,7 @@ impl<R: BufRead> CsvReader<R> {
         }
     }
 
-    /// The cells of the next line that is not empty, and further lines if a quoted cell goes on.
+    /// The cells of the next line that is not empty, and further lines if a quoted cell continues.
     fn record(&mut self) -> Result<Option<(usize, Vec<String>)>, CsvError> {
         let mut text = String::new();
         while text.trim().is_empty() {

@@ -29,7 +29,7 @@ pub struct MixtureAfterUpdates {
     pub applied: u64,
     /// Candidates that the mixture covered already, so that walkers would not collect them.
     pub covered: u64,
-    /// Candidates that the model cannot evaluate or the mixture cannot take up.
+    /// Candidates that the model cannot evaluate or the mixture cannot be updated with.
     pub left_out: u64,
 }
 
@@ -61,7 +61,7 @@ pub fn updating_settings(campaign: &CampaignRecord) -> Result<SelectorSettings, 
 /// Applies the candidates in decision order by the campaign's rules: those that meet the collection rule under the mixture so far
 /// update it. Features are those of `model`, to which `mixture` belongs. `None` after a cancellation of `stop`.
 ///
-/// Warns of a candidate that the model cannot evaluate or the mixture cannot take up, and goes on.
+/// Warns of a candidate that the model cannot evaluate or the mixture cannot be updated with, and continues.
 ///
 /// A candidate counts as labelled if `calmwalk export` writes it under the protocol in force. Updates are as the campaign's are now:
 /// once it has switched to additive ones, also those by earlier candidates are additive.

@@ -65,7 +65,7 @@ impl VersionOnDisk {
         Ok(Self { version, model, mixture })
     }
 
-    /// The version that a decision of the log takes up, with its files in `directory`.
+    /// The version that a decision of the log switches to, with its files in `directory`.
     ///
     /// # Errors
     /// A damaged database, a full disk.
@@ -102,7 +102,7 @@ impl VersionOnDisk {
     }
 }
 
-/// The decision that took up the version of the potential to which this version of the mixture belongs; `None` for that of the
+/// The decision that switched to the version of the potential to which this version of the mixture belongs; `None` for that of the
 /// configuration.
 pub async fn taken_up_before(
     store: &Store,

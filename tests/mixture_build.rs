@@ -119,7 +119,7 @@ fn an_interrupted_build_continues_and_another_is_refused() {
     let state = here.join("out.npz.build");
     wait_until("a shard is finished", || state.join("pass-1").exists());
     let held = PausedProcesses::new([child.id()]);
-    assert!(fail(here, &started).contains("another process builds out.npz"));
+    assert!(fail(here, &started).contains("another process is building out.npz"));
     signal(child.id(), "INT");
     held.resume();
     let output = child.wait_with_output().unwrap();

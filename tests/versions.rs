@@ -96,7 +96,7 @@ fn campaign(mode: &str) -> TempDir {
     directory
 }
 
-/// Version 1, which is in force; version 2, which was refused; version 3, which is not taken up yet.
+/// Version 1, which is in force; version 2, which was refused; version 3, which no walk uses yet.
 fn three_versions(mode: &str) -> TempDir {
     let directory = campaign(mode);
     on_store(directory.path(), async |store| {
@@ -195,7 +195,7 @@ fn an_exported_version_has_the_bytes_of_the_store_and_replaces_nothing() {
 
     fs::remove_file(here.join("out/1/kokkos.npz")).unwrap();
     let said = succeed(here, export);
-    assert!(said.starts_with("wrote out/1/kokkos.npz\nout/1/gmm_artifacts.npz is there already"), "{said}");
+    assert!(said.starts_with("wrote out/1/kokkos.npz\nout/1/gmm_artifacts.npz already exists"), "{said}");
     fs::remove_file(here.join("out/1/kokkos.npz")).unwrap();
     fs::write(here.join("out/1/gmm_artifacts.npz"), "another").unwrap();
     let message = refuse(here, export);
@@ -225,7 +225,7 @@ fn an_earlier_version_is_registered_again() {
     assert!(refuse(here, ["versions", "here", "roll-back", "1"]).contains("is being run by"));
     drop(lock);
     let said = succeed(here, ["versions", "here", "roll-back", "1"]);
-    let expected = "registered version 4: version 1 again\nthe next calmwalk run starts every walk of the plan anew with it\n";
+    let expected = "registered version 4: version 1 again\nthe next calmwalk run restarts all walks from their seed structures with it\n";
     assert_eq!(said, expected);
     let (versions, files) = on_store(here, async |store| {
         (store.versions().await.unwrap(), store.version_files(4).await.unwrap().unwrap())
@@ -247,7 +247,9 @@ fn a_running_live_campaign_may_go_back() {
     let _lock = CampaignLock::acquire(&here.join("here"), "calmwalk run").unwrap();
     let said = succeed(here, ["versions", "here", "roll-back", "0"]);
     assert!(
-        said.starts_with("registered version 4: version 0 again\nevery walk of the plan starts anew"),
+        said.starts_with(
+            "registered version 4: version 0 again\nall walks restart from their seed structures"
+        ),
         "{said}"
     );
     assert_eq!(on_store(here, async |store| store.version_files(4).await.unwrap()), Some(real_files()));
@@ -285,7 +287,7 @@ fn walks_do_not_find_again_what_they_found_before_the_campaign_went_back() {
     assert_eq!(before["found"]["candidates"]["accepted"], accepted);
 
     let message = refuse(here, ["refit", "here"]);
-    assert!(message.contains("there is no section [refit]") && message.contains("replay = "), "{message}");
+    assert!(message.contains("has no section [refit]") && message.contains("replay = "), "{message}");
 }
 
 /// Writes a configuration with a training program that fails, and starts it. Returns when a walk has begun.

@@ -236,8 +236,7 @@ fn an_artifact_must_belong_to_the_model() {
 #[test]
 fn a_mixture_without_statistics_can_be_scored_with_but_not_updated() {
     let tester = ConfigTester::new();
-    let advice =
-        "scored with but not updated; give the gmm_artifacts.npz of the build, or leave calm.artifact out";
+    let advice = "grade structures but cannot be updated; give the gmm_artifacts.npz of the build, or leave calm.artifact out";
     let export = path(MODEL);
     tester.refused_with(&path(ARTIFACT), &export, &["calm.artifact: ", &export, advice]);
     tester.write("stripped.npz", without(ARTIFACT, |name| name.starts_with("scatter_")));

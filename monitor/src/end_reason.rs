@@ -75,7 +75,7 @@ impl CampaignEnd {
     }
 }
 
-/// Whether a version of the potential is left to train when all walks have ended, after which walks go on.
+/// Whether a version of the potential is left to train when all walks have ended, after which walks continue.
 pub async fn is_refit_due(store: &Store) -> Result<bool, StoreError> {
     let rules = RefitRules::from_json(&configuration_in_force(store).await?);
     Ok(rules.max_versions > 0 && RefitProgress::read(store, rules).await?.is_refit_left())

@@ -9,7 +9,7 @@ use store::{
 };
 use wire::ContentHash;
 
-/// Name of the value of the selector with the version that the decision log has taken up.
+/// Name of the value of the selector with the version that the decision log last switched to.
 const TAKEN_UP: &str = "version";
 
 /// Where a version stands.

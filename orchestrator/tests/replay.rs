@@ -56,7 +56,7 @@ fn open(campaign: &Campaign<'_>, settings: &SelectorSettings, seeds: usize, set:
     Replay::new(settings.clone(), set, seeds, grader(), mixture(), None, imported).unwrap()
 }
 
-/// The original mixture of the version that a decision takes up.
+/// The original mixture of the version that a decision switches to.
 fn original_of(decision: &LoggedDecision) -> Arc<Mixture> {
     mixture_of(decision.detail["version"].as_u64().unwrap() as u32)
 }
@@ -173,7 +173,7 @@ proptest! {
         check_exact(&campaign.finish(false), &settings, scripts.len());
     }
 
-    /// Two versions of the potential are taken up, the second after walks made room for it; or it was refused.
+    /// The log switches to two versions of the potential, to the second after walks made room for it; or it was refused.
     #[test]
     fn replays_include_versions_of_the_potential(
         settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize,

@@ -44,7 +44,7 @@ class Server:
         self._arenas: Optional[Arenas] = None
 
     def answer(self, line: bytes) -> tuple[dict[str, Any], bool]:
-        """The answer to one line, and whether the server goes on after it. Never raises."""
+        """The answer to one line, and whether the server continues after it. Never raises."""
         message: dict[str, Any] = {}
         try:
             message = protocol.parse(line)

@@ -99,7 +99,7 @@ class Errors(unittest.TestCase):
         self.assertNotIn("\n", answer["message"])
         for part in parts:
             self.assertIn(part, answer["message"])
-        self.assertIsNone(client.process.poll(), "the server goes on")
+        self.assertIsNone(client.process.poll(), "the server continues")
 
     def test_of_hello(self) -> None:
         with Client() as client, tempfile.TemporaryDirectory() as folder:

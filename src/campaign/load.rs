@@ -39,7 +39,7 @@ const SUSPICIOUS_SHARE: f64 = 0.25;
 const TRAINING_FRAMES: &str = "calm.training_frames";
 
 /// What to do about a mixture without scatter matrices and counts.
-const NO_STATISTICS: &str = "no scatter matrices and counts, so its mixture can be scored with but not updated; give the \
+const NO_STATISTICS: &str = "no scatter matrices and counts, so its mixture can grade structures but cannot be updated; give the \
                           gmm_artifacts.npz of the build, or leave calm.artifact out and set update = \"never\" to \
                           take the mixture of the export as it is";
 
@@ -141,7 +141,7 @@ impl Loader<'_> {
         }
         let key = "collect.update_target".to_owned();
         let expected = format!(
-            "a rule after which a structure of {atoms} atoms is no candidate any more ({}): otherwise walks collect the \
+            "a rule after which a structure of {atoms} atoms is no longer a candidate ({}): otherwise walks collect the \
              same structure again and again",
             criterion.condition(atoms)
         );

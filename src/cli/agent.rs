@@ -18,13 +18,13 @@ use crate::web::{self, agent_metrics::AgentState};
 
 /// Run walkers on this host for a campaign led by `calmwalk run --listen` on another host
 ///
-/// Starts walkers that share one copy of the mixture, and sends the candidates they find to the orchestrator. Waits for an
-/// orchestrator that has not started yet, and keeps working through connection losses. Exits when the campaign has no more
-/// work (exit code 0), or on Ctrl-C or SIGTERM (exit code 130). Walks are checkpointed within seconds of SIGTERM, so the notice
-/// of a batch system suffices. See docs/hosts.md.
+/// Starts walkers that share one copy of the mixture, and sends the candidates they find to the orchestrator. Waits for an orchestrator
+/// that has not started yet, and keeps working through connection losses. Exits when the campaign has no more work (exit code 0), or
+/// on Ctrl-C or SIGTERM (exit code 130). Checkpoints its walks within seconds of SIGTERM, so the notice of a batch system suffices.
+/// See docs/hosts.md.
 #[derive(Debug, clap::Args)]
 pub struct AgentArgs {
-    /// Address of the orchestrator, such as tcp/head:7447, or @FILE as written by `run --announce`. FILE is read again when the
+    /// Address of the orchestrator, such as tcp/head:7447, or @FILE of `calmwalk run --announce`. The agent reads FILE again when the
     /// orchestrator stops answering
     #[arg(long, value_name = "ENDPOINT")]
     join: Address,
@@ -38,17 +38,17 @@ pub struct AgentArgs {
     /// decision. Useful only in campaigns with more walks than walkers
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=4096))]
     prefetch: u32,
-    /// Exit with an error after this time without an orchestrator or without an answer from it, such as 10m
+    /// Exit with an error after waiting this long for an orchestrator, or for an answer from it, such as 10m
     #[arg(long, value_name = "TIME", default_value_t = Duration::from_seconds(3600), value_parser = duration_between("6s", "10000h"))]
     wait_timeout: Duration,
     /// Directory with authority.pem, certificate.pem and key.pem; required unless the endpoint is a loopback address
     #[arg(long, value_name = "DIR")]
     tls: Option<PathBuf>,
-    /// Environment of a model in Python on this host, if it is not that of the configuration (potential.python.environment)
+    /// Python environment on this host [default: potential.python.environment of the configuration]
     #[arg(long, value_name = "DIR")]
     python_environment: Option<PathBuf>,
-    /// Device that evaluates a model in Python on this host, such as cuda:1, if it is not that of the configuration
-    /// (potential.python.device). Repeat it for several devices
+    /// Device of this host that evaluates a model in Python, such as cuda:1; may be repeated [default: potential.python.device of the
+    /// configuration]
     #[arg(long = "device", value_name = "NAME")]
     devices: Vec<String>,
     /// Serve this agent's metrics to Prometheus at this address, such as 127.0.0.1:9465 (docs/metrics.md)

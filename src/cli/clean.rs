@@ -10,8 +10,8 @@ use crate::output::{count, print};
 
 /// Remove shared-memory files left behind by killed processes
 ///
-/// Each run does this at its start and end; use the command for killed campaigns that you do not resume. Skips running
-/// campaigns, and removes nothing that a campaign needs to resume.
+/// Each run cleans up at its start and end. Use this command for killed campaigns that you do not resume. Skips running campaigns, and
+/// removes nothing that a campaign needs to resume.
 #[derive(Debug, clap::Args)]
 pub struct CleanArgs {
     /// Directories of campaigns [default: all campaigns of this user on this host]

@@ -20,18 +20,18 @@ use crate::{build_info, runtime};
 
 /// Check what this machine has for campaigns, and what is missing for which feature
 ///
-/// Looks at shared memory, limits, the file system of the campaign, processor, Python environment, device, DFT codes and batch
-/// systems. Nothing is changed; programs are only asked for their versions. With CONFIG, the exit code is 1 if something is
-/// missing that this campaign needs; without, it is 0.
+/// Checks shared memory, limits, the file system of the campaign, processor, Python environment, device, DFT codes and batch systems.
+/// Changes nothing, and runs other programs only to ask for their versions. With CONFIG, the exit code is 1 if this campaign needs
+/// something that is missing; without, it is 0.
 #[derive(Debug, clap::Args)]
 pub struct DoctorArgs {
-    /// Configuration of a campaign (TOML): what it needs must be there
+    /// Also check what the campaign with this configuration (TOML) needs
     #[arg(value_name = "CONFIG")]
     config: Option<PathBuf>,
     /// Directory of the campaign [default: path of the configuration without its extension, or the current directory]
     #[arg(long, value_name = "DIR")]
     directory: Option<PathBuf>,
-    /// Python environment to look at: a virtual environment, a conda prefix, or an interpreter [default: that of the configuration,
+    /// Python environment to check: a virtual environment, a conda prefix, or an interpreter [default: that of the configuration,
     /// or python3 on the path]
     #[arg(long, value_name = "ENV")]
     python: Option<PathBuf>,

@@ -23,11 +23,12 @@ const SHOWN: usize = 20;
 
 /// Estimate the cost of a campaign before it starts
 ///
-/// Shows the largest number of labels that the configuration allows, their expected cost, the time of the walks and the disk use.
-/// The time of the walks follows from a few steps measured on this host. The cost of a label is extrapolated from the labels of
-/// another campaign (--cost-from) or from one test label (--core-seconds, see `calmwalk label-file`). Grades every seed structure
-/// as `calmwalk validate` does, and shows the worst: elements, closest pair, γ_max, whether the collection rule is met
-/// (docs/seed-structures.md).
+/// Shows the largest number of labels that the configuration allows, their expected cost, the time of the walks and the disk use. Measures a
+/// few steps on this host for the time of the walks. Extrapolates the cost of a label from the labels of another campaign (--cost-from)
+/// or from one test label (--core-seconds, see `calmwalk label-file`).
+///
+/// Also grades every seed structure as `calmwalk validate` does, and shows the worst: elements, closest pair, γ_max, and whether they meet
+/// the collection rule (docs/seed-structures.md).
 #[derive(Debug, clap::Args)]
 pub struct EstimateArgs {
     /// Configuration of the campaign (TOML)

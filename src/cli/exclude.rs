@@ -9,9 +9,9 @@ use crate::output::{TextTable, print, print_json, warn_if_unencrypted};
 
 /// Exclude bad labels from exports and statistics, or include them again
 ///
-/// An excluded label stays in the store with its history, but exports, force and energy errors, the energy offsets of the
-/// elements, summaries, reports and the dashboard's statistics ignore it. Its cost still counts. Another result for the
-/// structure does not replace it, unless requested with `calmwalk relabel`.
+/// An excluded label stays in the store with its history. Exports, reports and all statistics (force and energy errors, energy offsets,
+/// summaries, the dashboard) ignore it; its cost still counts. Another result for the structure does not replace it unless you request
+/// one with `calmwalk relabel`.
 ///
 /// Works while the campaign runs. Changes either all given structures or none.
 #[derive(Debug, clap::Args)]

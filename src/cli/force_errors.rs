@@ -22,13 +22,16 @@ const NAMES: usize = 3;
 ///
 /// Relates the force error |F_model − F_label| of each labelled atom to its grades γ and γ_nbr under the original mixture:
 /// median and percentiles in bins of the grade, Spearman's ρ, and the area under the receiver operating characteristic
-/// (ROC-AUC) of the grade as a test for errors above 1 eV/Å. The errors of structures whose labels failed are unknown: these
-/// structures are counted separately ('without label') in their bins. Energy errors exclude a fitted offset per element, because
-/// labels and potential have different zeros of energy. Biased walks are compared with their controls, matched by pairs and pooled,
-/// with tests and with confidence intervals by bootstrap over seed structures; docs/errors.md defines each number. Bounds of the force error by γ_nbr
-/// are told with how often they held for labels that came later. In a campaign with several versions of the potential, all this is of the
-/// structures from walks with one version, and a table compares the versions, each by its own grades. Works while the campaign
-/// runs.
+/// (ROC-AUC) of the grade as a test for errors above 1 eV/Å. Structures whose labels failed have no error: each bin counts them as
+/// 'without label'. Energy errors exclude a fitted offset per element, because labels and potential have different zeros of energy.
+///
+/// Biased walks are compared with their controls, matched by pairs and pooled,
+/// with tests and with confidence intervals by bootstrap over seed structures. docs/errors.md defines each number.
+///
+/// Also shows, by γ_nbr, the error below which 90 % of force errors are expected, and how often that held for later labels.
+///
+/// With several versions of the potential, the numbers are those of one version (--version), and a table compares all, each by its
+/// own grades. Works while the campaign runs.
 #[derive(Debug, clap::Args)]
 pub struct ForceErrorsArgs {
     #[command(flatten)]

@@ -15,16 +15,15 @@ use crate::xyz_reader::{XyzReader, label};
 
 /// Import labelled structures, or structures for labelling
 ///
-/// With --queue, structures wait for a label under the protocol in force, behind candidates of the same priority; frames need no labels.
-/// Their labels are made as all others, and exported with --imported. Structures that have a label or wait for one stay as they are.
+/// Imports labels: each frame needs energy and forces, named energy and forces or REF_energy and REF_forces; stress is optional. If one
+/// frame is invalid or exceeds label.max_force, max_stress or max_energy_per_atom, imports nothing from any file. You can safely import
+/// a file again: known structures do not change, and a different label for a labelled structure is stored as a check.
 ///
-/// Otherwise, each frame needs energy and forces, named energy and forces or REF_energy and REF_forces; stress is optional. If one frame
-/// is invalid or exceeds label.max_force, max_stress or max_energy_per_atom, nothing is imported from any file. Importing
-/// again is safe: known structures are not changed, and a different label for a labelled structure is stored as a check beside
-/// it.
+/// With --queue, frames need no labels. The structures join the label queue of the current protocol, behind candidates of the same
+/// priority. `calmwalk export --imported` exports them. Structures that have a label or wait for one stay as they are.
 ///
-/// The campaign must not be running: imported structures change which candidates are duplicates, and the decision log records
-/// when.
+/// The campaign must not be running: imported structures change which candidates are duplicates, and the decision log records from
+/// where on.
 #[derive(Debug, clap::Args)]
 pub struct ImportArgs {
     #[command(flatten)]

@@ -20,14 +20,14 @@ use own_campaign::OwnCampaignArgs;
 
 /// Create the campaign.toml of your own campaign, or a small example that runs
 ///
-/// With --model, --structures and --label: writes a configuration of about twenty keys for them, with units and usual ranges in
-/// comments. Temperatures, τ, supercells, ZBL windows and collection rule are suggestions from model and structures. On a
-/// terminal, calmwalk asks for options that are missing. Lines that begin with FILL IN are yours to complete, such as the version
-/// of VASP; `calmwalk validate` refuses them until then. Paths are relative to DIR for files below it, absolute for others.
+/// With --model, --structures and --label, writes a configuration of about twenty keys, with units and usual ranges in comments. Suggests
+/// temperatures, τ, supercells, ZBL windows and collection rule from model and structures. On a terminal, asks for missing options.
+/// Complete the values that begin with FILL IN, such as the version of VASP; `calmwalk validate` refuses them until then. Paths are
+/// relative to DIR for files below it, absolute for others.
 ///
-/// Without these options: writes a small example with all of its files, which lists every key.
+/// Without these options, writes a small example with all of its files, which lists every key.
 ///
-/// Also writes campaign.schema.json, which lets an editor complete and check campaign.toml. Existing files are never overwritten.
+/// Also writes campaign.schema.json, with which an editor completes and checks campaign.toml. Never overwrites existing files.
 #[derive(Debug, clap::Args)]
 pub struct InitArgs {
     /// Directory for the files; created if it does not exist

@@ -20,9 +20,9 @@ const RETRY_INTERVAL: std::time::Duration = std::time::Duration::from_secs(2);
 
 /// Start labellers for a campaign on any host that reaches its store
 ///
-/// Uses the method, protocol and limits of the campaign's [label] section. Each of the --concurrency labellers is a separate
-/// process. Waits for label jobs until the campaign is finished (exit code 0), also while no run is active. On Ctrl-C or
-/// SIGTERM, labels in progress that do not finish within --grace-period return to the queue (exit code 130).
+/// Uses the method, protocol and limits of the campaign's [label] section, and starts --concurrency labellers as separate processes. Waits
+/// for label jobs until the campaign is finished (exit code 0), also while no run is active. On Ctrl-C or SIGTERM, returns labels to the
+/// queue that do not finish within --grace-period (exit code 130).
 #[derive(Debug, clap::Args)]
 pub struct LabelArgs {
     /// Store of the campaign: its directory (on the host that runs it), or the postgres:// URL
@@ -34,11 +34,11 @@ pub struct LabelArgs {
     /// Exit with an error unless the campaign uses this label method, such as vasp [default: accept any method]
     #[arg(long, value_name = "NAME")]
     method: Option<String>,
-    /// Take the program's command and the file paths for this host from the [label] section of FILE; its protocol must equal the
+    /// Read the program's command and the file paths for this host from the [label] section of FILE; its protocol must equal the
     /// campaign's [default: as on the host of `calmwalk run`]
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Path on this host of a file that the method needs (pseudopotential, potential); matched by content. Repeatable
+    /// Path on this host of a file that the method needs (pseudopotential, potential); matched by content; may be repeated
     #[arg(long = "file", value_name = "PATH")]
     files: Vec<PathBuf>,
     /// Exit when the queue is empty and no run is active

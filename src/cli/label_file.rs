@@ -21,9 +21,9 @@ use crate::signals::cancel_on_signal;
 
 /// Label the structures of a file, to test a label protocol without a campaign
 ///
-/// Computes energy, forces and stress of one structure after the other by the [label] section of --config, and prints them with
-/// the cost. Stops at the first failure. Pass the printed core-seconds to `calmwalk estimate --core-seconds` to estimate the
-/// cost of a campaign.
+/// Computes energy, forces and stress of one structure after the other, as the [label] section of --config says, and prints them with the
+/// cost. Stops at the first failure. Pass the printed core-seconds to `calmwalk estimate --core-seconds` to estimate the cost of a
+/// campaign.
 #[derive(Debug, clap::Args)]
 pub struct LabelFileArgs {
     /// Structures to label: extended XYZ or POSCAR

@@ -14,9 +14,9 @@ use crate::process_config::{self, LabellerConfig};
 
 /// Internal: a labeller process, started by `calmwalk run` and `calmwalk label`
 ///
-/// Reads its settings from standard input. If the `calmwalk run` that started it is killed, it continues until the queue is empty
-/// or the next run takes it over; if `calmwalk label` is killed, it exits. On SIGTERM it exits after the current label. A
-/// calculation of an external program that needs more than a few seconds keeps running and is left to the next labeller.
+/// Reads its settings from standard input. If the `calmwalk run` that started it is killed, it continues until the queue is empty or the
+/// next run takes it over; if `calmwalk label` is killed, it exits. On SIGTERM it exits after the current label. If a calculation of an
+/// external program needs more than a few seconds, it leaves the running calculation to the next labeller.
 #[derive(Debug, clap::Args)]
 pub struct LabellerArgs {}
 

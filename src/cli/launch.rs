@@ -46,11 +46,11 @@ pub struct LaunchArgs {
     /// extension]
     #[arg(long, value_name = "DIR")]
     directory: Option<PathBuf>,
-    /// Accept CONFIG for a campaign that was started with another configuration file (calmwalk refuses it otherwise)
+    /// Accept CONFIG for a campaign that was started with another configuration file [default: refuse it]
     #[arg(long)]
     adopt: bool,
-    /// As `calmwalk run --accept-reference-check`, for the check as it is now; if the protocol, the structures or the bounds
-    /// change later, it must pass again
+    /// Start walks although the current reference check failed (see `calmwalk run --help`). If protocol, structures or bounds change, the
+    /// check must pass again
     #[arg(long)]
     accept_reference_check: bool,
     /// Number of agents, one per job
@@ -65,7 +65,7 @@ pub struct LaunchArgs {
     /// Number of jobs that compute labels; only for campaigns with a PostgreSQL store
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=10_000))]
     labellers: u32,
-    /// Number of labels that each of these jobs computes at the same time
+    /// Number of labels that each labelling job computes at the same time
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1024))]
     concurrency: u32,
     /// Number of GPUs of each job with walkers: the orchestrator's and the agents' (`--gres=gpu:N`, or {gpus} in a script)
@@ -96,7 +96,7 @@ pub struct LaunchArgs {
     /// Print the job scripts and the commands of the batch system without running them
     #[arg(long)]
     dry_run: bool,
-    /// Cancel the campaign's jobs instead, so that they checkpoint and exit; launch it again to resume
+    /// Cancel the campaign's jobs, so that they checkpoint and exit; launch the campaign again to resume
     #[arg(long)]
     stop: bool,
     /// With --stop: cancel only pending jobs

@@ -9,12 +9,12 @@ use crate::output::{TextTable, decimals, print, print_json, warn_if_unencrypted}
 
 /// List labels for which a lower magnetic state is known, or replace them by it
 ///
-/// A calculation may converge to another magnetic state, most of all after a failure, when it starts from other initial
-/// moments. A structure is listed if another valid result by the same label protocol has a lower energy than its label, by more
-/// than label.min_state_difference. Excluded results do not count.
+/// A calculation may converge to another magnetic state, above all after a failure, when it starts from other initial moments. Lists a
+/// structure if another valid result by the same label protocol is lower in energy than its label by more than
+/// label.min_state_difference. Ignores excluded results.
 ///
-/// With IDs or --all, the lowest result becomes the label of each structure. The old label stays in the store as superseded,
-/// with date and reason. Works while the campaign runs. Changes either all given structures or none.
+/// With IDs or --all, makes the lowest result the label of each structure. The old label stays in the store as superseded, with date and
+/// reason. Works while the campaign runs. Changes either all given structures or none.
 #[derive(Debug, clap::Args)]
 pub struct LowerStatesArgs {
     #[command(flatten)]

@@ -62,7 +62,7 @@ pub enum QueueCommand {
     Prioritise {
         /// Id of the candidate
         id: String,
-        /// Larger values are labelled first. Default: 10 for structures of biased walks, 0 for frames of control walks
+        /// Higher values are labelled first. Structures of biased walks start with 10, frames of control walks with 0
         #[arg(allow_negative_numbers = true)]
         priority: i32,
     },

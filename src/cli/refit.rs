@@ -25,16 +25,15 @@ const HOLDER: &str = "calmwalk refit";
 
 /// Train a new version of a campaign's potential now, from the labels so far
 ///
-/// Does once, in this process, what calmwalk run does by itself when a refit is due (section [refit] of the configuration). It
-/// does not wait for after_structures or after_time, and trains beyond max_versions and stop.min_improvement; no walk starts with
-/// a version beyond them. The new version is registered or refused by the same rules. An interrupted refit goes on with the same
-/// command.
+/// Trains one version in the foreground, without waiting for after_structures or after_time of section [refit]. It also trains when
+/// max_versions or stop.min_improvement has ended the refits of the campaign; walks then do not use the new version. The same rules
+/// register or refuse the version as in calmwalk run. The same command continues an interrupted refit.
 ///
-/// Live mode: at any time. A campaign that runs takes the new version up. Reproducible mode: only when nothing runs the campaign,
-/// all its walks have ended and all its labels are final, so that the result does not depend on the moment. The next calmwalk run
-/// takes the new version up.
+/// Live mode: use it at any time; a running campaign switches to the new version. Reproducible mode: use it when nothing runs the
+/// campaign, all walks have ended and all labels are final, so that the result does not depend on the moment. The next calmwalk run
+/// switches to the new version.
 ///
-/// Exit codes: 0 registered, or nothing is new since the last attempt; 1 refused, or another failure; 2 invalid input; 130
+/// Exit codes: 0 registered, or nothing new since the last attempt; 1 refused, or another failure; 2 invalid input; 130
 /// interrupted.
 #[derive(Debug, clap::Args)]
 pub struct RefitArgs {
@@ -141,7 +140,7 @@ impl RefitArgs {
         match path.is_file() {
             true => Ok(path),
             false => Err(CommandError::Input(format!(
-                "{}, the configuration of the last calmwalk run, is no file of this host: give it with --config CONFIG",
+                "{}, the configuration of the last calmwalk run, does not exist on this host: give it with --config CONFIG",
                 path.display()
             ))),
         }
@@ -152,9 +151,9 @@ impl RefitArgs {
 fn section(campaign: &LoadedCampaign) -> Result<&RefitSection, CommandError> {
     campaign.config.refit.as_ref().ok_or_else(|| {
         CommandError::Input(format!(
-            "{}: there is no section [refit], so the campaign keeps its potential. Add [refit] with replay = [\"FILE.extxyz\"] \
-             (labelled structures that the potential knows) to the configuration of a new campaign: a started one keeps what it \
-             has. calmwalk upfit trains on an export of any campaign",
+            "{}: the configuration has no section [refit], so the campaign keeps its potential. A started campaign cannot get one: \
+             add [refit] with replay = [\"FILE.extxyz\"] (labelled structures that the potential knows) to the configuration \
+             of a new campaign. calmwalk upfit trains on an export of any campaign",
             campaign.path.display()
         ))
     })
@@ -192,7 +191,7 @@ async fn check_is_over(store: &Store, campaign: &LoadedCampaign) -> Result<(), C
     let status = store.status().await?;
     match status.labels.queued + status.labels.leased {
         labels if labels > 0 && !status.finished => Err(CommandError::Input(format!(
-            "{} of this reproducible campaign {} not made yet: calmwalk run {config} makes them",
+            "{} of this reproducible campaign {} still missing: calmwalk run {config} computes them",
             count(labels, "label"),
             if labels == 1 { "is" } else { "are" }
         ))),
@@ -220,7 +219,7 @@ fn directory(location: &Location, known: Option<&Provenance>) -> Result<PathBuf,
     match Path::new(directory).is_dir() {
         true => Ok(PathBuf::from(directory)),
         false => Err(CommandError::Input(format!(
-            "'{directory}', the directory of the campaign in its last run, is not on this host: train on the host of that run"
+            "'{directory}', the directory of the campaign in its last run, does not exist on this host: run calmwalk refit on the host of that run"
         ))),
     }
 }

@@ -15,7 +15,7 @@ use crate::{log, process_config};
 /// Reads its settings from standard input. Exits with the process that started it; the next one continues.
 #[derive(Debug, clap::Args)]
 pub struct RefitterArgs {
-    /// End the processes with this mark when standard input is closed, and do nothing else
+    /// Only end the processes with this mark when standard input is closed
     #[arg(long, value_name = "MARK")]
     end_marked: Option<PathBuf>,
 }

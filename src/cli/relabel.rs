@@ -21,19 +21,19 @@ use crate::wording;
 
 /// Compute labels again, or switch the campaign to another label protocol
 ///
-/// Queues the structures again, bypassing the label guard. Use it for doubtful or inaccurate labels. The old label stays valid
-/// until the new one exists; then it is kept as superseded, with date and reason. If the new label fails, the old one stays.
-/// Structures that already wait for a new label are not queued twice.
+/// Queues the structures again, bypassing the label guard. Use it for doubtful or inaccurate labels. The old label stays valid until the
+/// new one exists, and then stays in the store as superseded, with date and reason. If the new label fails, the old one stays valid.
+/// Queues no structure twice.
 ///
-/// With --config, the campaign switches to the label protocol of that file: structures without a label move to it, and running
-/// calculations are cancelled. The campaign must not be running, and the next `calmwalk run` needs that configuration.
+/// With --config, switches the campaign to the label protocol of that file: structures without a label move to it, and calmwalk cancels
+/// running calculations. The campaign must not be running, and the next `calmwalk run` needs that configuration.
 #[derive(Debug, clap::Args)]
 #[command(group = clap::ArgGroup::new("target").required(true).args(["ids", "all", "condition"]))]
 pub struct RelabelArgs {
     #[command(flatten)]
     location: CampaignArgs,
-    /// Structures to relabel, also those labelled by the current protocol: ids, unique prefixes of ids, or decision numbers of
-    /// candidates, import-N of structures that calmwalk import --queue queued
+    /// Structures to relabel, also those labelled by the current protocol. Candidates: ids, unique prefixes of ids, or decision numbers;
+    /// structures of `calmwalk import --queue`: import-N
     #[arg(value_name = "ID")]
     ids: Vec<String>,
     /// Relabel every structure whose label comes from another protocol than the current one

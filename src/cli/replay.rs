@@ -15,12 +15,12 @@ const SHOWN: usize = 20;
 
 /// Replay a campaign's decisions, to verify them or to test other selection rules
 ///
-/// Passes the recorded candidates to the selector again, without dynamics or labels, and changes nothing. Without --set, every
-/// decision and the mixture must be reproduced bit by bit; otherwise the first difference is printed and the exit code is 1.
+/// Passes the recorded candidates to the selector again, without dynamics or labels, and changes nothing. Without --set, expects every
+/// decision and the mixture bit by bit as recorded; at the first difference, prints it and exits with code 1.
 ///
-/// With --set, shows which candidates other rules would accept. The walks stay as recorded, which limits the result: structures
-/// that walkers never offered do not appear under a looser rule, walks that would have continued are not continued, and
-/// trajectories do not react to the changed mixture.
+/// With --set, shows which candidates other rules would accept. The walks stay as recorded, which limits the result: a looser rule does
+/// not find structures that walkers never offered, walks that would have continued do not continue, and trajectories do not react to the
+/// changed mixture.
 #[derive(Debug, clap::Args)]
 pub struct ReplayArgs {
     #[command(flatten)]

@@ -52,12 +52,12 @@ pub struct RunArgs {
     /// Directory of the campaign, created if it does not exist [default: path of the configuration without its extension]
     #[arg(long, value_name = "DIR")]
     directory: Option<PathBuf>,
-    /// Accept CONFIG for a campaign that was started with another configuration file (calmwalk refuses it otherwise)
+    /// Accept CONFIG for a campaign that was started with another configuration file [default: refuse it]
     #[arg(long)]
     adopt: bool,
-    /// Start the walks even if the reference check failed (label.reference_check): labels differ from the known values by more
-    /// than the bounds. calmwalk records this, and repeats the check when the protocol, the structures or the bounds change. =ID
-    /// accepts only the check with this identity
+    /// Start the walks although the reference check failed, that is, labels differ from the known values by more than the bounds of
+    /// label.reference_check. calmwalk records this, and repeats the check when protocol, structures or bounds change. =ID accepts only the
+    /// check with this identity
     #[arg(long, value_name = "ID", num_args = 0..=1, require_equals = true, default_missing_value = ANY_CHECK)]
     accept_reference_check: Option<String>,
     /// Run walkers and labellers as threads of this process instead of as separate processes; uses no shared memory
@@ -399,7 +399,7 @@ async fn warn_if_disk_is_too_small(
     Ok(())
 }
 
-/// Why the campaign does not go on, and how it does.
+/// Why the campaign does not continue, and what makes it continue.
 async fn paused_by_alarm(campaign: &LoadedCampaign, store: &Store) -> Result<CommandError, CommandError> {
     let values = MixtureValues(store.values().await?).training_frames();
     let measured = ForgettingMeasurement::deserialize(values).map_err(CommandError::failed)?;

@@ -24,22 +24,22 @@ use crate::structure_files::StructureReadingArgs;
 
 /// Select structures for labelling from a pool
 ///
-/// Grades every structure of the pool and picks with one strategy or with several in a row, each from what is left:
+/// Grades the pool, then applies the strategies in order; each picks from the structures that are left:
 ///
-/// greedy: the structure with the largest γ first; after each pick, a copy of the mixture learns it (additive update). Ends when no γ is
-/// above --min-gamma, or after N structures.
+/// greedy: picks the structure with the largest γ, then updates a copy of the mixture with it (additive update). Ends when no γ is above
+/// --min-gamma, or after N structures.
 ///
-/// fps (fps-extrap): picks the atom within the window that is farthest from those picked, in whitened features, and takes its
-/// structure. Starts from what earlier strategies picked. fps-all: over all atoms, in plain features.
+/// fps (fps-extrap): finds the atom within the grade window that is farthest from the picked ones, in whitened features, and picks its
+/// structure. Starts from the structures that earlier strategies picked. fps-all: uses all atoms, in plain features.
 ///
 /// d-optimal: picks the structure whose atoms within the window raise log det Σ zzᵀ most, summed over the elements (z: features). Starts
-/// from the training data, which weigh as much as one atom of each element, and from what earlier strategies picked.
+/// from the training data, which weigh as much as one atom of each element, and from the structures that earlier strategies picked.
 ///
 /// random (random-all): uniformly at random. random-extrap: among structures with an atom within the window.
 ///
-/// Writes what the frames had, with selection_strategy, selection_rank (from 1), gamma_max (at the pick), and source_file and
-/// source_frame (from 0), or campaign, candidate_id and fate. `calmwalk import --queue` brings them into a campaign for labelling. Reads
-/// files twice and keeps the features of atoms within the window only; see docs/select.md.
+/// Copies each picked frame and adds selection_strategy, selection_rank (from 1) and gamma_max (at the pick). Frames of files also get
+/// source_file and source_frame (from 0), candidates of campaigns also campaign, candidate_id and fate. `calmwalk import --queue`
+/// queues them in a campaign for labelling. See docs/select.md.
 #[derive(Debug, clap::Args)]
 pub struct SelectArgs {
     /// GRACE model (kokkos.npz)
@@ -54,21 +54,21 @@ pub struct SelectArgs {
     pool: Vec<PathBuf>,
     #[command(flatten)]
     reading: StructureReadingArgs,
-    /// Also the candidates of a campaign's biased walks: its directory or the postgres:// URL of its store; may be repeated. Stored
-    /// features are used where the store has them
+    /// Add the candidates of a campaign's biased walks to the pool: its directory or the postgres:// URL of its store; may be repeated.
+    /// Uses stored features where the store has them
     #[arg(long, value_name = "DIR")]
     campaign: Vec<PathBuf>,
     /// Take only declined candidates from campaigns
     #[arg(long, requires = "campaign")]
     declined: bool,
-    /// Of campaigns, leave out candidates whose features are not stored or belong to another model or projection; otherwise the model is
-    /// evaluated on them
+    /// Leave out candidates of campaigns whose features are not stored or belong to another model or projection [default: evaluate the
+    /// model on them]
     #[arg(long, requires = "campaign")]
     no_evaluation: bool,
     /// Strategies in order, each with its number of structures: greedy, fps, fps-all, d-optimal, random, random-extrap
     #[arg(long, value_name = "NAME[:N]", num_args = 1.., value_delimiter = ',', default_value = "greedy")]
     strategy: Vec<StrategyQuota>,
-    /// Number of structures, for a single strategy [default for greedy: all that it finds]
+    /// Number of structures of a single strategy [default for greedy: all with γ above --min-gamma]
     #[arg(long, short = 'n', value_name = "N")]
     number: Option<usize>,
     /// Lower limit of the grade window: atoms with γ above it count
@@ -80,9 +80,9 @@ pub struct SelectArgs {
     /// Greedy: γ that an update must reach for a picked structure
     #[arg(long, value_name = "GAMMA", default_value_t = 1.25)]
     update_target: f64,
-    /// Minimum number of atoms of each element in what is selected [default: D + 1, the feature dimension plus one; greedy alone: none]
+    /// Minimum number of atoms of each element in the selection [default: D + 1, the feature dimension plus one; greedy alone: none]
     ///
-    /// If an element has fewer, structures with many of its atoms replace the last ones that other strategies than greedy picked.
+    /// If an element has fewer, structures with many of its atoms replace the last picks of the strategies other than greedy.
     #[arg(long, value_name = "ATOMS")]
     min_per_element: Option<u64>,
     /// No minimum number of atoms of each element
@@ -94,7 +94,7 @@ pub struct SelectArgs {
     /// Threads [default: all cores]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Features in memory, GB; the others are in a temporary file beside the output
+    /// Memory for features, GB; a temporary file beside the output holds the rest
     #[arg(long, value_name = "GB", default_value_t = 4.0)]
     memory: f64,
     /// File for the selected structures, extended XYZ; an existing file is replaced at the end

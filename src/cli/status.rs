@@ -41,8 +41,8 @@ pub struct StatusArgs {
     /// Print JSON
     #[arg(long)]
     json: bool,
-    /// Show all walks, processes and versions of the potential, and what is forgotten of each element and component, instead of a
-    /// selection that fits a screen (JSON always contains all)
+    /// Show all walks, processes and versions of the potential, and the forgetting of each element and component [default: a selection that
+    /// fits a screen; JSON always contains all]
     #[arg(long)]
     all: bool,
     /// Number of walks to show, or all: running walks with the largest γ first [default: as many as fit a screen]

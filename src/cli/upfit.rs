@@ -24,14 +24,14 @@ use crate::structure_files::{StructureReadingArgs, file_weight};
 /// with the new weights, for calmwalk and LAMMPS. Labels are read as by `calm score`: energy, forces, stress or virial, or the same
 /// with REF_. The result does not depend on the number of threads.
 ///
-/// If the labels' energies have another zero than the model's, the shifts of the elements are fitted first. --validation-share holds
-/// out whole seed structures (`seed_structure` of a frame, as `calmwalk export` writes it; otherwise single frames); the weights with
-/// the smallest validation loss are written.
+/// First fits a shift of the energy per element if labels and model have different zeros. --validation-share holds out whole seed
+/// structures (`seed_structure` of a frame, as `calmwalk export` writes it; otherwise single frames). Writes the weights with the smallest
+/// validation loss.
 ///
 /// The new file has no mixture, since the old one does not fit the new weights: build one with `calmwalk calm build`.
 ///
-/// Keeps its state in NEW.npz.upfit until the model is written. After an interruption (Ctrl-C, SIGTERM, a crash), the same command
-/// continues, to the same bytes.
+/// Keeps its state in NEW.npz.upfit until it has written the model. After an interruption (Ctrl-C, SIGTERM, a crash), the same command
+/// continues, and gives the same bytes.
 #[derive(Debug, clap::Args)]
 pub struct UpfitArgs {
     /// GRACE model (kokkos.npz)
@@ -58,20 +58,20 @@ pub struct UpfitArgs {
     /// Weights of the loss. demo: energy 20, forces 5, stress 20; paper: 1, 5 and 0.1, after 5/12 of the epochs 25, 1 and 0.1
     #[arg(long, value_name = "NAME", value_enum, default_value_t = LossName::Demo)]
     loss: LossName,
-    /// Weight of the errors of the energy per atom, in place of that of --loss
+    /// Weight of the errors of the energy per atom [default: that of --loss]
     #[arg(long, value_name = "W", value_parser = not_negative)]
     energy_weight: Option<f64>,
-    /// Weight of the errors of force components, in place of that of --loss
+    /// Weight of the errors of force components [default: that of --loss]
     #[arg(long, value_name = "W", value_parser = not_negative)]
     force_weight: Option<f64>,
-    /// Weight of the errors of stress components, in place of that of --loss
+    /// Weight of the errors of stress components [default: that of --loss]
     #[arg(long, value_name = "W", value_parser = not_negative)]
     stress_weight: Option<f64>,
     /// δ of the Huber loss: larger errors count linearly, eV/atom, eV/Å and eV/Å³ [default: 0.01]
     #[arg(long, value_name = "DELTA", value_parser = positive)]
     huber_delta: Option<f64>,
-    /// Weight of the structures of a file of DATA, 0 or more [default: 1], times calmwalk_weight of a frame if it has that key; may be
-    /// repeated
+    /// Weight of the structures of a file of DATA, 0 or more; multiplies calmwalk_weight of a frame that has it; may be repeated
+    /// [default: 1]
     #[arg(long, value_name = "FILE=W", value_parser = file_weight)]
     weight: Vec<(PathBuf, f64)>,
     /// Learning rate of the first update; it falls by half a cosine
@@ -86,7 +86,7 @@ pub struct UpfitArgs {
     /// Random seed of the validation set and of the order of the structures
     #[arg(long, value_name = "N", default_value_t = 42)]
     rng_seed: u64,
-    /// Do not train the weights whose names begin with NAME; an unknown name lists all. May be repeated
+    /// Do not train the weights whose names begin with NAME; may be repeated. An unknown name makes calmwalk list all names
     #[arg(long, value_name = "NAME,…", value_delimiter = ',')]
     freeze: Vec<String>,
     /// Threads; each takes whole structures of a batch [default: all cores]

@@ -18,10 +18,12 @@ const SHOWN: usize = 20;
 
 /// Check a configuration and all files that it refers to
 ///
-/// Reports all errors with file, line and key (exit code 2). Valid but suspicious values are warnings on standard error and do
-/// not change the exit code. Grades every seed structure under the original mixture, measures a few steps on this host to
-/// estimate the time of walks, and shows the worst seed structures, each with the pair of elements that is closest to its
-/// minimum distance. --csv has all seed structures with all their pairs (docs/seed-structures.md).
+/// Reports all errors with file, line and key (exit code 2). Warns of valid but unusual values on standard error, without changing the exit
+/// code.
+///
+/// Grades every seed structure under the original mixture, measures a few steps on this host to estimate the time of walks, and shows the
+/// worst seed structures, each with the pair of elements that is closest to its minimum distance. --csv writes all seed structures with
+/// all their pairs (docs/seed-structures.md).
 #[derive(Debug, clap::Args)]
 pub struct ValidateArgs {
     /// Configuration of a campaign (TOML)

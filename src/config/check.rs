@@ -99,7 +99,7 @@ fn check_stop(config: &Config) -> Result<(), InvalidValue> {
     let expected = match &config.refit {
         None => "[refit]: without it, no version of the potential is trained",
         Some(refit) if refit.held_out == 0.0 && refit.test_sets.is_empty() => {
-            "refit.held_out above 0, or refit.test_sets: the improvement is that of errors on such labels"
+            "refit.held_out above 0, or refit.test_sets: the errors on these labels measure the improvement"
         }
         Some(_) => return Ok(()),
     };
@@ -213,7 +213,7 @@ fn check_mixture(config: &Config) -> Result<(), InvalidValue> {
     }
     if calm.update != UpdateProtocol::Never && calm.artifact.is_none() {
         let expected = "the gmm_artifacts.npz of the model: an export alone has no scatter matrices and counts, so its \
-                        mixture can be scored with but not updated (with update = \"never\" the artifact may be left out)";
+                        mixture can grade structures but cannot be updated (with update = \"never\" the artifact may be left out)";
         return wrong("calm.artifact", "left out", expected);
     }
     Ok(())

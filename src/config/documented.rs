@@ -86,7 +86,7 @@ fn uncommented(text: &str) -> String {
     lines.join("\n")
 }
 
-/// What the file says behind a key: the comment of its line and of the lines below that go on with it.
+/// What the file says behind a key: the comment of its line and of the lines below that continue it.
 fn comment_of(text: &str, section: &str, key: &str) -> String {
     let place =
         keys(text).into_iter().find(|(s, k, ..)| (s.as_str(), k.as_str()) == (section, key)).unwrap().3;

@@ -13,16 +13,16 @@ use crate::duration::Duration;
 #[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct NotifySection {
-    /// The command and its arguments. Default: none, and no notification is sent.
+    /// The command and its arguments. Default: none; calmwalk sends no notifications.
     #[schemars(length(min = 1))]
     pub command: Option<Vec<String>>,
-    /// Events for which the command is run.
+    /// Events for which calmwalk runs the command.
     pub on: Vec<NotifyEvent>,
-    /// Time without a new candidate or label after which a campaign has stalled.
+    /// Time without a new candidate or label after which calmwalk reports that the campaign has stalled.
     pub stall_timeout: Duration,
-    /// Number of failed labels after which the command is run, and again after as many more.
+    /// calmwalk runs the command each time that this many more labels have failed.
     pub failed_labels: NonZeroU32,
-    /// Time after which the command is killed.
+    /// Time after which calmwalk kills the command.
     pub time_limit: Duration,
 }
 

@@ -28,7 +28,7 @@ pub struct PythonSection {
     #[serde(default)]
     #[schemars(with = "std::collections::BTreeMap<String, serde_json::Value>")]
     pub options: serde_json::Map<String, serde_json::Value>,
-    /// Device that evaluates the model: `cpu`, `cuda`, `cuda:1`, …; or a list of devices, over which walkers are dealt evenly.
+    /// Device that evaluates the model: `cpu`, `cuda`, `cuda:1`, …; or a list of devices, which share the walkers evenly.
     #[serde(default)]
     pub device: DeviceNames,
     /// Number of processor threads of the program.
@@ -37,14 +37,14 @@ pub struct PythonSection {
     /// Largest number of structures that the device evaluates at once. If its memory is too small for that, it evaluates fewer.
     #[serde(default = "defaults::max_batch")]
     pub max_batch: NonZeroU32,
-    /// Time after which a call that has no answer counts as failed: the program is started again.
+    /// Time limit of a call. After it, calmwalk starts the program again.
     #[serde(default = "defaults::python_timeout")]
     pub timeout: Duration,
-    /// The same for the start, and for the first calls of each size, for which frameworks compile.
+    /// Time limit for the start, and for the first call of each size, which frameworks compile.
     #[serde(default = "defaults::compile_timeout")]
     pub compile_timeout: Duration,
-    /// Directory in which frameworks keep compiled programs for the next start, and calmwalk the size of batches that the memory of the
-    /// device takes. Default: none.
+    /// Directory in which frameworks keep compiled programs for the next start, and calmwalk keeps the batch size that fits the
+    /// device's memory. Default: none.
     #[serde(default)]
     pub cache: Option<PathBuf>,
 }

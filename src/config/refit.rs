@@ -21,16 +21,18 @@ pub struct RefitSection {
     /// Weight of each structure of `replay` in the training, times its `calmwalk_weight`. A label of the campaign has the weight 1.
     #[serde(default = "defaults::replay_weight")]
     pub replay_weight: Positive,
-    /// Number of structures accepted since the last attempt after which a refit begins. Default: when all walks have ended.
+    /// A refit starts when the campaign has accepted this many structures since the last attempt. Default: when all walks have
+    /// ended.
     #[serde(default)]
     pub after_structures: Option<NonZeroU32>,
-    /// Time since the last attempt after which a refit begins if there is anything new, in live mode. Default: none.
+    /// In live mode, a refit also starts this long after the last attempt, if there is anything new. Default: none.
     #[serde(default)]
     pub after_time: Option<Duration>,
     /// Number of versions to train; the campaign ends with the last one. Refused ones do not count.
     #[serde(default = "defaults::max_versions")]
     pub max_versions: NonZeroU32,
-    /// Share of the seed structures whose labels are never trained on, from 0 up to, not including, 1.
+    /// Share of the seed structures whose labels no version is trained on; these labels judge each version. From 0 up to, not
+    /// including, 1.
     #[serde(default = "defaults::held_out")]
     #[schemars(extend("minimum" = 0, "exclusiveMaximum" = 1))]
     pub held_out: f64,
@@ -41,7 +43,7 @@ pub struct RefitSection {
     /// refused.
     #[serde(default = "defaults::max_held_out_error_ratio")]
     pub max_held_out_error_ratio: Positive,
-    /// Number of attempts after which a training that crashes is refused.
+    /// Number of times that calmwalk tries a training that crashes.
     #[serde(default = "defaults::refit_attempts")]
     pub max_attempts: NonZeroU32,
     /// Number of threads of a refit. 0: all cores.
@@ -56,11 +58,11 @@ pub struct RefitSection {
     /// What the labels of control frames are for.
     #[serde(default)]
     pub control_frames: ControlFrames,
-    /// Further labelled structures. The errors of each version on them are shown, and decide nothing.
+    /// Further labelled structures. calmwalk shows the errors of each version on them; they decide nothing.
     #[serde(default)]
     pub test_sets: Vec<TestSetSection>,
-    /// Labelled structures to train a second model with for each version, in place of the campaign's: as many, from the first on. Its
-    /// errors are shown beside those of the version.
+    /// Labelled structures. For each version, calmwalk trains a second model with them in place of the campaign's labels: with as
+    /// many, from the first on. It shows the errors beside those of the version.
     #[serde(default)]
     pub comparisons: Vec<TestSetSection>,
 }
@@ -83,7 +85,7 @@ pub enum ControlFrames {
     /// Versions are trained on them too.
     #[default]
     Train,
-    /// A second model is trained with them for each version, in place of the structures of biased walks.
+    /// For each version, calmwalk trains a second model with them in place of the structures of biased walks.
     Compare,
 }
 
@@ -127,13 +129,13 @@ pub struct NativeRefit {
     pub stress_weight: Option<f64>,
     /// δ of the Huber loss: larger errors count linearly; eV/atom, eV/Å and eV/Å³.
     pub huber_delta: Positive,
-    /// Beginnings of the names of weights that are not trained.
+    /// Do not train the weights whose names begin with one of these.
     pub freeze: Vec<String>,
     /// Number of epochs without a new minimum of the validation loss after which the training ends. Default: never.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub patience: Option<NonZeroU64>,
-    /// Decay, at each update, of a moving average of the weights, which is validated and written in their place; from 0 up to, not
-    /// including, 1. Default: no average.
+    /// Decay, at each update, of a moving average of the weights; calmwalk validates and writes the average in their place. From
+    /// 0 up to, not including, 1. Default: no average.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("minimum" = 0, "exclusiveMaximum" = 1))]
     pub average: Option<f64>,
@@ -161,7 +163,7 @@ pub struct CommandRefit {
     /// The program and its arguments.
     #[schemars(length(min = 1))]
     pub program: Vec<String>,
-    /// Time after which the program is killed. Default: no limit.
+    /// Time after which calmwalk kills the program. Default: no limit.
     #[serde(default)]
     pub time_limit: Option<Duration>,
 }

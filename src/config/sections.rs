@@ -122,7 +122,7 @@ pub enum OnInvalid {
 pub struct CollectSection {
     /// Rule by which a walker sends a structure as a candidate.
     pub criterion: CollectionRule,
-    /// Grade at which an update of the mixture is strong enough.
+    /// Rule that an update of the mixture must meet: it takes the smallest α that does.
     pub update_target: calm::UpdateRule,
     /// Minimum number of steps between two collected structures of a walk.
     #[serde(default = "defaults::min_interval")]
@@ -139,7 +139,8 @@ pub struct CollectSection {
     /// Largest number of structures collected by the campaign.
     #[serde(default)]
     pub max_structures: Option<NonZeroU32>,
-    /// Smallest probability of its label's completion with which a structure is collected. Left out: every structure is.
+    /// Smallest probability that the label of a structure completes, for the structure to be collected, in live mode. Default: no
+    /// limit.
     #[serde(default)]
     pub min_completion_probability: Option<Fraction>,
     /// Space in the store for feature vectors of declined candidates, MB.
@@ -159,8 +160,7 @@ pub struct GuardSection {
     pub max_grade: Option<Positive>,
     /// Highest allowed kinetic temperature, K.
     pub max_temperature: Positive,
-    /// Whether a walk rolls back to a checkpoint when the guard rejects one configuration after the other. If not, it
-    /// goes on.
+    /// Whether a walk rolls back to a checkpoint when the guard rejects one configuration after the other. If not, it continues.
     pub rollback: bool,
     /// Number of rejected configurations in a row after which a walk rolls back to a checkpoint.
     pub max_consecutive_rejections: NonZeroU32,
@@ -205,7 +205,7 @@ pub struct LabelSection {
     /// Difference in energy above which two results for a structure are different magnetic states, eV/atom.
     #[serde(default = "defaults::min_state_difference")]
     pub min_state_difference: Positive,
-    /// What to do when a result has a lower energy than the label by more than that: propose it, or make it the label.
+    /// What to do when a result has a lower energy than the label by more than `min_state_difference`.
     #[serde(default)]
     pub on_lower_state: LowerStatePolicy,
     /// Number of cores of one calculation.
@@ -214,7 +214,7 @@ pub struct LabelSection {
     /// Number of GPUs of one calculation.
     #[serde(default)]
     pub gpus: u32,
-    /// Time after which a calculation is ended.
+    /// Time after which calmwalk ends a calculation.
     #[serde(default = "defaults::time_limit")]
     pub time_limit: Duration,
     /// Memory limit of one calculation, GB.
@@ -236,13 +236,13 @@ pub struct LabelSection {
     /// The batch system of `launch.custom`, for `batch_system = "custom"`.
     #[serde(skip)]
     pub scheduler: Option<CustomScheduler>,
-    /// Order in which queued structures of equal priority are labelled: as they were found, or by value.
+    /// Order in which queued structures of equal priority are labelled.
     #[serde(default)]
     pub order: LabelOrder,
     /// Number of unfinished label jobs above which `on_queue_full` applies.
     #[serde(default = "defaults::queue_limit")]
     pub queue_limit: NonZeroU32,
-    /// What to do then: walkers wait, or the selector raises the threshold.
+    /// What happens above `queue_limit`.
     #[serde(default)]
     pub on_queue_full: QueueFull,
     /// Checks of a structure before it is labelled.
@@ -258,7 +258,7 @@ pub struct LabelSection {
 #[serde(deny_unknown_fields, default)]
 pub struct ReferenceCheckSection {
     /// Extended XYZ file of structures with energy, forces and, where known, stress by the reference that the potential was
-    /// trained on. Default: nothing is compared.
+    /// trained on. Default: no check.
     #[schemars(with = "Option<PathBuf>")]
     pub structures: Option<Spanned<PathBuf>>,
     /// Largest difference in energy, after the offsets of the elements are fitted, eV/atom.
@@ -273,7 +273,7 @@ pub struct ReferenceCheckSection {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LabelOrder {
-    /// As they were found.
+    /// In the order in which they were found.
     #[default]
     Found,
     /// By the value of their labels: expected error × probability of completion ÷ cost, where structures unlike those with

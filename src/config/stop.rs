@@ -13,8 +13,8 @@ pub struct StopSection {
     /// Largest number of steps that the biased walks make together after the last accepted structure. Then all of them end.
     /// Default: no limit.
     pub max_steps_without_structure: Option<NonZeroU64>,
-    /// Smallest relative fall of the force errors on held-out labels for each 100 labels that a version of the potential was
-    /// trained on in addition. A version with less is the last, and no walk starts with it. Default: none.
+    /// Smallest relative fall of the force errors on held-out labels, for each 100 labels more than the parent was trained on. A
+    /// version with less is the last, and no walk starts with it. Default: none.
     pub min_improvement: Option<Positive>,
 }
 

@@ -27,7 +27,7 @@ pub struct WalkSection {
     /// Time step, fs. Default: 2 fs, or 0.5 fs with H, He, Li or Be.
     #[serde(default)]
     pub time_step: Option<Positive>,
-    /// Thermostat: Langevin or Nosé–Hoover.
+    /// Thermostat: Langevin, Nosé–Hoover or velocity rescaling.
     #[serde(default = "defaults::thermostat")]
     #[schemars(transform = schema::without_none)]
     pub thermostat: ThermostatSettings,
@@ -47,7 +47,7 @@ pub struct WalkSection {
     /// Bias on the cell of walks with a barostat. Default: none.
     #[serde(default)]
     pub cell_bias: Option<CellBiasSection>,
-    /// Whether the energy that an update of the mixture gives to a biased walk is taken out of its kinetic energy again.
+    /// Whether calmwalk removes the energy that an update of the mixture gives to a biased walk from its kinetic energy.
     #[serde(default)]
     pub remove_update_work: bool,
     /// Number of steps over which the norms in τ_r are averaged.
@@ -67,7 +67,7 @@ pub struct WalkSection {
 pub struct WalkGroupSection {
     /// Name, by which views and filters select the walks of the group.
     pub name: String,
-    /// Filter of the seed structures that the group walks from, by `atoms`, `element` and `seed`. Default: all.
+    /// Filter of the seed structures that the group walks from, by `atoms`, `element` and `seed_structure`. Default: all.
     #[serde(default)]
     pub seed_structures: Option<String>,
     /// Temperatures of the thermostat, K. Default: `walk.temperature`.
@@ -82,13 +82,13 @@ pub struct WalkGroupSection {
     /// V/V₀ at which walks at constant pressure start. Default: `walk.start_volume`.
     #[serde(default)]
     pub start_volumes: Vec<Positive>,
-    /// Whether the cell of walks at constant pressure is biased. Default: if there is a table `walk.cell_bias`.
+    /// Whether the cell of walks at constant pressure is biased. Default: true if there is a table `walk.cell_bias`.
     #[serde(default)]
     pub cell_bias: Option<bool>,
     /// Scales τ of the uncertainty force. Default: `walk.tau`.
     #[serde(default)]
     pub tau_values: Vec<Positive>,
-    /// Number of walks under each combination of conditions, which differ in their random numbers.
+    /// Number of walks under each combination of conditions; they differ in their random numbers.
     #[serde(default = "defaults::repeats")]
     pub repeats: NonZeroU32,
 }
@@ -123,7 +123,7 @@ pub struct CellBiasSection {
     pub volume_range: [Positive; 2],
     /// Number of collected structures after which a walk can end at a boundary of the volume.
     pub end_after_collected: u32,
-    /// Number of contacts with a boundary within a window after which such a walk ends.
+    /// Number of contacts with a boundary, within `window` steps, after which such a walk ends.
     pub end_after_contacts: NonZeroU32,
 }
 

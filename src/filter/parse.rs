@@ -12,7 +12,7 @@ const MAX_DEPTH: usize = 100;
 const ORIGINS: [&str; 3] = ["biased", "control", "imported"];
 
 /// Synonyms of property names, for hints.
-const SYNONYMS: [(&str, &str); 14] = [
+const SYNONYMS: [(&str, &str); 13] = [
     ("gamma_max", "gamma"),
     ("grade", "gamma"),
     ("natoms", "atoms"),
@@ -26,7 +26,6 @@ const SYNONYMS: [(&str, &str); 14] = [
     ("volume", "relative_volume"),
     ("v", "relative_volume"),
     ("t", "temperature"),
-    ("version", "mixture_version"),
 ];
 
 /// A text that is no filter expression.

@@ -356,7 +356,7 @@ fn lock(
     match lock(&file) {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => {
-            Err(CommandError::Failed(format!("another process builds {} now", output.display())))
+            Err(CommandError::Failed(format!("another process is building {}", output.display())))
         }
         Err(TryLockError::Error(error)) => Err(cannot_write(path, error)),
     }

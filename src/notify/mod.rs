@@ -112,11 +112,11 @@ impl NotificationTracker {
         due
     }
 
-    /// Reports that a run cannot go on, every time.
+    /// Reports that a run cannot continue, every time.
     pub fn failed(&mut self, why: &str) -> Option<Notification> {
         let event = NotifyEvent::Failure;
         self.is_wanted(event)
-            .then(|| Notification { event, message: format!("calmwalk run cannot go on: {why}") })
+            .then(|| Notification { event, message: format!("calmwalk run cannot continue: {why}") })
     }
 
     fn stall(&mut self, so_far: (u64, u64), shown: String, now: i64) -> Option<Notification> {

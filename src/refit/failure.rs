@@ -8,9 +8,9 @@ use crate::exit_status::CommandError;
 /// Why a refit ends without a new version.
 #[derive(Debug)]
 pub enum RefitFailure {
-    /// The new version is refused for this reason, and the campaign goes on with the one that it has.
+    /// The new version is refused for this reason, and the campaign continues with the one that it has.
     Refused(String),
-    /// The refit cannot go on: a disk, the database, a file of the configuration. The same refit continues later.
+    /// The refit cannot continue: a disk, the database, a file of the configuration. The same refit continues later.
     Failed(CommandError),
 }
 

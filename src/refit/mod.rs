@@ -1,7 +1,7 @@
 //! A refit: trains a new version of the potential from the labels of a campaign, builds its mixture, judges it, and registers or
 //! refuses it.
 //!
-//! Each step leaves files in a directory of the refit, and is skipped if they are there. A refit that was killed goes on from them, to
+//! Each step leaves files in a directory of the refit, and is skipped if they are there. A refit that was killed continues from them, to
 //! the same bytes.
 
 mod command;
@@ -189,9 +189,7 @@ fn prepare_directory(campaign: &Path, number: u32, protocol: &str) -> Result<Pat
     let before: Option<FrozenSet> =
         fs::read(directory.join("set.json")).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
     if before.is_some_and(|before| before.protocol != protocol) {
-        log_and_warn(format_args!(
-            "refit {number}: begins again, since the labels have another protocol now"
-        ));
+        log_and_warn(format_args!("refit {number}: starts again, because the label protocol has changed"));
         fs::remove_dir_all(&directory).map_err(|error| cannot_write(&directory, error))?;
     }
     fs::create_dir_all(&directory).map_err(|error| cannot_write(&directory, error))?;

@@ -12,7 +12,7 @@ use crate::config::{Config, ControlFrames, RefitSection};
 pub struct RefitSchedule {
     /// The versions, and whether one is left to train.
     pub progress: RefitProgress,
-    /// Number of the version that the decision log has taken up.
+    /// Number of the version that the decision log last switched to.
     pub taken_up: u32,
 }
 
@@ -58,8 +58,8 @@ impl RefitSchedule {
             false => ("refit.max_versions", "raise"),
         };
         Some(format!(
-            "no walk starts: the campaign ended with version {}, the last one by {key}; {change} {key} to start all walks of the plan \
-             with that version (raised limits of walks alone start none)",
+            "no walk starts: the campaign ended with version {}, the last one by {key}; {change} {key} to start all planned walks \
+             with that version (raising limits of walks alone starts none)",
             newest.number
         ))
     }
@@ -210,7 +210,7 @@ mod tests {
         assert_eq!((schedule.in_force().unwrap().number, schedule.refit_at(&refit)), (1, Some(0)));
         let why = schedule.why_no_walk_starts().unwrap();
         assert!(why.contains("version 2") && why.contains("raise refit.max_versions"), "{why}");
-        // With a larger limit it goes on with that version.
+        // With a larger limit it continues with that version.
         schedule.progress.rules.max_versions = 3;
         assert!(!schedule.progress.is_refit_left() && !schedule.is_newest_without_walks());
         assert_eq!((schedule.in_force().unwrap().number, schedule.refit_at(&refit)), (2, Some(14)));

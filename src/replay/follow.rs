@@ -65,7 +65,7 @@ pub async fn follow(
     Ok(())
 }
 
-/// Replays the decision to take up a version of the potential, with the model and the mixture of that version.
+/// Replays the decision to switch to a version of the potential, with the model and the mixture of that version.
 async fn take_up_version(
     store: &Store,
     config: &Config,

@@ -28,7 +28,7 @@ pub struct ReplayReport {
     pub no_longer_accepted: Vec<FateChange>,
     /// Accepted in the replay but not in the campaign.
     pub newly_accepted: Vec<FateChange>,
-    /// Walks that ended with a quota and would go on in the replay. What they would find is unknown.
+    /// Walks that ended with a quota and would continue in the replay. What they would find is unknown.
     pub walks_cut_short: u64,
     /// Where the replay had to stop, if it did.
     pub stopped: Option<MissingFeatures>,
@@ -168,7 +168,7 @@ impl ReplayReport {
         }
     }
 
-    /// Records that the replay cannot go on with this decision.
+    /// Records that the replay cannot continue with this decision.
     pub fn stop(&mut self, decision: &LoggedDecision) {
         self.stopped = Some(MissingFeatures {
             decision: decision.sequence,

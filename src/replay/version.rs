@@ -13,7 +13,7 @@ use crate::exit_status::CommandError;
 use crate::output::Bar;
 
 /// The mixture of a version between the first and the newest, by the accepted candidates before it. `original` is the artifact
-/// with which the campaign began, or that of the version of the potential that the decision `begin` took up.
+/// with which the campaign began, or that of the version of the potential that the decision `begin` switched to.
 ///
 /// # Errors
 /// Updates that are not reproduced as recorded; a damaged database.

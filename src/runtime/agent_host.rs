@@ -138,7 +138,7 @@ async fn run_version(
     match device_watch::last_failure(&devices) {
         Some(failure) if ended != ExitStatus::Done && !stop.is_cancelled() => {
             Err(CommandError::Failed(format!(
-                "{failure}\nthe assignments of this host went back to the orchestrator: mend the cause and start the agent again"
+                "{failure}\nthe assignments of this host went back to the orchestrator: fix the cause and start the agent again"
             )))
         }
         _ => {

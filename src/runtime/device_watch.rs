@@ -1,4 +1,4 @@
-//! Watches the devices of a model in Python: what they do, and what happens when a program fails for good: walks end, labels go on.
+//! Watches the devices of a model in Python: what they do, and what happens when a program fails for good: walks end, labels continue.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -18,7 +18,7 @@ use crate::output::log_and_print;
 const WRITE_INTERVAL: Duration = Duration::from_secs(3);
 
 /// What follows for a campaign when a device has failed for good.
-pub const LABELS_GO_ON: &str = "no walk goes on, labels are still made";
+pub const LABELS_GO_ON: &str = "no walk continues; labels are still computed";
 
 /// Ends the walks with a device, and writes what the devices do to a store. Dropping it ends the watch.
 pub struct DeviceWatch(Vec<JoinHandle<()>>);

@@ -74,7 +74,7 @@ async fn run_in(
     let memory = HostMemory::open(place, host_sizes(campaign), &mixture, session(process), devices)?;
     let (model, addresses) = (campaign.walker_model()?, memory.addresses());
     let HostMemory { prepared: _prepared, mixture: shared, server, calls: _calls } = memory;
-    // The manager cancels it too, when the run cannot go on.
+    // The manager cancels it too, when the run cannot continue.
     let stopping = run.stop.child_token();
     let limits = Limits {
         heartbeat_timeout: campaign.config.walker_heartbeat_timeout(),
@@ -98,7 +98,7 @@ async fn run_in(
     let agents = AgentService::open(run, session(process), &mixture).await?;
     let no_more_work = CancellationToken::new();
     let walks = stopping.child_token();
-    // Agents stop too when walks cannot go on here: with a later run, they join again.
+    // Agents stop too when walks cannot continue here: with a later run, they join again.
     let tokens = StopTokens { stopping: walks.clone(), closing: no_more_work.clone() };
     let remote = agents.run(tokens, to_reactor);
     let serving = tokio::spawn(async {

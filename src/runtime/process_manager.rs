@@ -145,7 +145,7 @@ impl<'a> ProcessManager<'a> {
         self.ended == [true; 2] && self.label_checks.is_none()
     }
 
-    /// Fails if the campaign cannot go on.
+    /// Fails if the campaign cannot continue.
     pub fn failure(&self) -> Result<(), CommandError> {
         self.failure.clone().map_or(Ok(()), |failure| Err(CommandError::Failed(failure)))
     }

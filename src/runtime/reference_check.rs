@@ -109,7 +109,7 @@ fn refusal(config: &Path, faults: &[String]) -> CommandError {
     CommandError::Failed(format!(
         "the labels contradict the reference of label.reference_check: {shown}. No walk was started. Compare [label.method] with the \
          reference that the potential was trained on (functional, pseudopotentials, cutoff, k-points, smearing, magnetic moments, \
-         which energy), and the units of the file. If the differences are meant, run calmwalk run {} --accept-reference-check, or \
+         which energy), and the units of the file. If you expect these differences, run calmwalk run {} --accept-reference-check, or \
          calmwalk launch with this option",
         config.display()
     ))

@@ -90,7 +90,7 @@ impl Tasks {
         Ok(Self { walkers, labellers, reactor, superseded, external_labels, closing, stopping, _watch })
     }
 
-    /// Waits for all of them. A labeller that cannot go on stops the campaign, because its queue could only grow.
+    /// Waits for all of them. A labeller that cannot continue stops the campaign, because its queue could only grow.
     async fn finish(mut self) -> Result<reactor::RunOutcome, CommandError> {
         let mut failure = None;
         let ended = loop {

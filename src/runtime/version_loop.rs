@@ -137,7 +137,7 @@ pub async fn restore_selector(campaign: &LoadedCampaign, store: &Store) -> Resul
     Ok(selector)
 }
 
-/// Number of accepted structures at which walks make room for a refit. Walks of a live campaign go on beside it, until its last
+/// Number of accepted structures at which walks make room for a refit. Walks of a live campaign continue beside it, until its last
 /// version is there.
 async fn refit_at(campaign: &LoadedCampaign, store: &Store) -> Result<Option<u32>, CommandError> {
     let config = &campaign.config;

@@ -81,7 +81,7 @@ pub fn table(versions: &CampaignVersions) -> String {
     if let (Some(version), false) = (newest, compared.is_empty()) {
         let (names, number) = (compared.join(", "), version.number);
         text += &format!(
-            "{names}: trained as version {number}, with as many of these structures in place of the campaign's\n"
+            "{names}: trained like version {number}, on as many of these structures in place of the campaign's\n"
         );
     }
     text
@@ -164,7 +164,7 @@ pub mod tests {
         assert_eq!(rows[0], ["liquid", "5", "0.2000", "0.1000", "0.2500", "0.3000"]);
         assert_eq!(rows[1], ["held_out", "30", "0.4000", "0.2000", "0.5000", "–"]);
         assert!(text.contains("version 0  1 (40 labels)  3 (120 labels)  control\n"), "{text}");
-        assert!(text.contains("control: trained as version 3, with as many of these structures"), "{text}");
+        assert!(text.contains("control: trained like version 3, on as many of these structures"), "{text}");
         let line = in_force(&versions, versions.in_force().unwrap());
         assert_eq!(line, "version 3 in force, trained on 120 labels; 1 refused");
         assert_eq!(refit(versions.refit.as_ref().unwrap()), "training version 4: epoch 12 of 50");

@@ -77,7 +77,7 @@ impl VersionRecord {
 }
 
 /// Which version of the potential drives each walk. Walks of a version have higher numbers than those of the versions before:
-/// when a version is taken up, its walks are created and no others any more.
+/// when the campaign switches to a version, its walks are created and no others any more.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct WalkVersions {
     /// First walk and number of each version, by walk. Walks before the first of them have version 0.

@@ -115,15 +115,15 @@ async fn each_kind_of_damage_is_found_and_described() {
         ),
         (
             "UPDATE decision SET kind = 'version', detail = '{\"version\":2}' WHERE sequence = 5",
-            "decision 5 takes up version 2 of the potential, which is not registered",
+            "decision 5 switches to version 2 of the potential, which is not registered",
         ),
         (
             "UPDATE decision SET kind = 'version', detail = '{\"version\":1,\"model\":\"a\"}' WHERE sequence = 5",
-            "decision 5 takes up version 1 of the potential, which has other files than the decision names",
+            "decision 5 switches to version 1 of the potential, which has other files than the decision names",
         ),
         (
             "INSERT INTO walk_conditions (walk, conditions) VALUES (7, '{\"version\":1}')",
-            "1 walks with versions of the potential that no decision takes up (such as 7)",
+            "1 walks with versions of the potential that no decision switches to (such as 7)",
         ),
         ("DELETE FROM version_file WHERE name = 'mixture'", "the mixture of version 1: it is missing"),
         ("UPDATE version_file SET data = substr(data, 1, 3)", "the model of version 1: its BLAKE3 hash is "),

@@ -80,8 +80,8 @@ fn parts_that_are_missing_killed_or_of_another_build_are_noticed() {
     wait_until("a shard is finished", || state.join("pass-1-1of2").exists());
     let held = PausedProcesses::new([running.0.id()]);
     let message = fail(here, &part("out.npz", 1, 1, 2));
-    assert!(message.contains("another process builds out.npz"), "{message}");
-    assert!(fail(here, &arguments("out.npz", &["data.extxyz"], &[])).contains("another process builds"));
+    assert!(message.contains("another process is building out.npz"), "{message}");
+    assert!(fail(here, &arguments("out.npz", &["data.extxyz"], &[])).contains("another process is building"));
     succeed(here, part("out.npz", 1, 2, 2));
     // This kills the part.
     drop(held);

@@ -56,7 +56,7 @@ pub struct GuardSettings {
     pub max_grade: Option<f64>,
     /// Temperature above which a walk ends, K.
     pub max_temperature: f64,
-    /// Whether a walk rolls back to a checkpoint after rejections; if not, it goes on.
+    /// Whether a walk rolls back to a checkpoint after rejections; if not, it continues.
     pub rollback: bool,
     /// Consecutive rejections by the same guard after which the walk rolls back to a checkpoint.
     pub max_consecutive_rejections: u32,

@@ -22,11 +22,11 @@ pub enum MinDistanceRule {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PerPair {
-    /// Fraction of d⁰.
+    /// Shortest allowed distance of a bonded pair, as a fraction of d⁰, its shortest distance in the seed structure.
     pub bonded: f64,
-    /// Fraction of Σr.
+    /// Shortest allowed distance of a pair that is not bonded, as a fraction of Σr, the sum of the covalent radii.
     pub nonbonded: f64,
-    /// Longest bond, as a multiple of Σr.
+    /// Longest bond, as a multiple of Σr, the sum of the covalent radii.
     pub bond_cutoff: f64,
     /// Shortest allowed distances of single pairs, Å, instead of these rules.
     #[schemars(
@@ -43,7 +43,7 @@ pub struct PerPair {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Uniform {
-    /// Å (paper: 1.2).
+    /// Shortest allowed distance, Å (paper: 1.2).
     pub min_distance: f64,
     /// Fraction of the shortest distance (paper: 0.75).
     pub fraction: f64,

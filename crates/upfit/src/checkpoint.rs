@@ -1,4 +1,4 @@
-//! The state of a training on disk, from which it goes on to the same bits.
+//! The state of a training on disk, from which it continues to the same bits.
 //!
 //! A file is a line that names the format, the BLAKE3 hash of the rest (32 bytes), and the rest in postcard's encoding: names
 //! and values that identify the training, then its state. It appears complete, by renaming.
@@ -24,7 +24,7 @@ const HASH_BYTES: usize = blake3::OUT_LEN;
 /// The state is saved again once this many times the duration of the last time has passed: it costs at most 5 % of the time.
 const PAUSE: u32 = 19;
 
-/// Everything that a training needs to go on.
+/// Everything that a training needs to continue.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrainingState {
     /// Finished epochs.

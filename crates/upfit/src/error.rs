@@ -1,11 +1,11 @@
-//! Why a training cannot begin or go on.
+//! Why a training cannot begin or continue.
 
 use std::path::PathBuf;
 
 use crate::energy_zero::EnergyZeroFault;
 use crate::frame_fault::FrameFault;
 
-/// Why a training cannot begin or go on.
+/// Why a training cannot begin or continue.
 #[derive(Debug, thiserror::Error)]
 pub enum UpfitError {
     /// A setting out of its range.

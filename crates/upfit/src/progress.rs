@@ -76,7 +76,7 @@ pub struct UpdateProgress {
 /// An event of a training.
 #[derive(Clone, Copy, Debug)]
 pub enum TrainingEvent<'a> {
-    /// The training begins, or goes on from a checkpoint.
+    /// The training begins, or continues from a checkpoint.
     Begun {
         /// Number of epochs that the checkpoint has; `None` without one.
         resumed: Option<u64>,

@@ -218,7 +218,7 @@ impl DecisionState {
     }
 
     /// Declines a candidate that cannot be graded, or that the mixture cannot be updated with (training atoms must still
-    /// have a grade), or a control frame with atoms too close. Its walk goes on: each later frame of a control walk is
+    /// have a grade), or a control frame with atoms too close. Its walk continues: each later frame of a control walk is
     /// still matched by step. The log has the reason; the candidate is not stored.
     pub fn leave_out(&mut self, id: WalkId, step: u64, error: &str, commit: &mut Commit) {
         self.left_out += 1;

@@ -24,7 +24,7 @@ use crate::grader::Grader;
 
 /// Name of the value that tells that updates have become additive.
 pub const ADDITIVE: &str = "additive_updates";
-/// Kind of the decision that takes up a version of the potential, and the value with its number.
+/// Kind of the decision that switches to a version of the potential, and the value with its number.
 pub const VERSION: &str = "version";
 
 /// Name of the value with the steps that biased walks made since the last accepted structure.
@@ -37,7 +37,7 @@ pub(super) struct DecisionState {
     pub min_distances: Vec<MinDistances>,
     pub regrader: Regrader,
     pub mixture: Arc<Mixture>,
-    /// Number of the version of the potential that the log has taken up.
+    /// Number of the version of the potential that the log has switched to.
     pub version: u32,
     pub forgetting: Forgetting,
     /// Updates are additive from here on: the mixture had forgotten too much.

@@ -59,7 +59,7 @@ pub enum SelectorError {
 }
 
 impl SelectorError {
-    /// Whether an error in a decision is the fault of its candidate, so that the campaign can go on without it.
+    /// Whether an error in a decision is the fault of its candidate, so that the campaign can continue without it.
     pub(super) fn is_of_candidate(&self) -> bool {
         matches!(
             self,

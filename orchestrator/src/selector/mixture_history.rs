@@ -32,7 +32,7 @@ pub struct AcceptedAtoms<'a> {
 }
 
 impl MixtureHistory {
-    /// The mixture before the first decision, or after the one that took up a version of the potential: `original` at the version
+    /// The mixture before the first decision, or after the one that switched to a version of the potential: `original` at the version
     /// of the mixture that the log has there. `settings` are those of [`super::SelectorSettings::search`], which never
     /// change during a campaign.
     pub fn new(settings: calm::UpdateSettings, original: Arc<Mixture>) -> Self {

@@ -202,7 +202,7 @@ impl Replay {
         Ok(decision.map(|decision| ReplayedDecision { decision, candidate }))
     }
 
-    /// Replays the decision to take up a version of the potential, with what grades depend on: the model's `grader`, its `original`
+    /// Replays the decision to switch to a version of the potential, with what grades depend on: the model's `grader`, its `original`
     /// mixture and, if they are monitored, the features of the `training` frames by that model. The decision is of kind
     /// [`super::VERSION`].
     pub fn take_up_version(

@@ -66,7 +66,7 @@ impl WalkTable {
         &self[id]
     }
 
-    /// Lets a walk that has ended go on.
+    /// Lets a walk that has ended continue.
     pub fn resume(&mut self, id: WalkId) {
         let walk = self.get_mut(id);
         walk.record.state = "waiting".to_owned();

@@ -22,8 +22,8 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
 /// Build scores to compare γ with: D-optimality, LLPR, distances, likelihood
 ///
-/// Reads all structures once, and again for D-optimality until its active sets no longer change. Memory does not depend on the
-/// amount of data. `calmwalk calm score --baseline` writes the scores of atoms, larger further outside.
+/// Reads all structures once; for D-optimality, repeatedly until its active sets no longer change. Memory does not depend on the amount of
+/// data. `calmwalk calm score --baseline` writes the scores of atoms; larger scores are further from the training data.
 ///
 /// Components (d-optimality-centred, d-optimality-component, euclidean, likelihood) are those of the artifact, or of the mixture in
 /// the model file; likelihood needs an artifact.

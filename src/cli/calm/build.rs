@@ -30,8 +30,8 @@ use crate::structure_files::{StructureArgs, StructureFiles, file_weight};
 ///
 /// Several hosts can share the work (--pass, --part, `calmwalk calm merge`); the artifact is the same.
 ///
-/// Keeps its state in CALM.npz.build until the artifact is written. After an interruption (Ctrl-C, SIGTERM, a crash), the same
-/// command continues from the last finished shards.
+/// Keeps its state in CALM.npz.build until it has written the artifact. After an interruption (Ctrl-C, SIGTERM, a crash), the same command
+/// continues from the last finished shards.
 #[derive(Debug, clap::Args)]
 pub struct CalmBuildArgs {
     /// GRACE model (kokkos.npz)
@@ -45,15 +45,16 @@ pub struct CalmBuildArgs {
     /// Also write a copy of the model with the new mixture, for LAMMPS and calmwalk
     #[arg(long, value_name = "MODEL.npz", conflicts_with = "feature_variant")]
     embed: Option<PathBuf>,
-    /// Features of the mixture: normalised or linear, with the projection matrix of the model file, or hidden [default: as the file says].
-    /// Mixtures of other features serve comparisons (`calm score`, `calm baseline`, `calm validate --compare-artifact`), not campaigns
+    /// Features of the mixture: normalised or linear, with the projection matrix of the model file, or hidden [default: those of the model
+    /// file]. Mixtures of other features are for comparisons (`calm score`, `calm baseline`, `calm validate --compare-artifact`), not for
+    /// campaigns
     #[arg(long, value_name = "VARIANT")]
     feature_variant: Option<FeatureVariant>,
-    /// Weight of the atoms of a file of DATA, 0 or more [default: 1], times calmwalk_weight of a frame if it has that key; may be repeated
+    /// Weight of the atoms of a file of DATA, 0 or more; multiplies calmwalk_weight of a frame that has it; may be repeated [default: 1]
     #[arg(long, value_name = "FILE=W", value_parser = file_weight)]
     weight: Vec<(PathBuf, f64)>,
-    /// Then update the mixture with the accepted candidates of this campaign that have no label (pending, failed, dropped or excluded),
-    /// so that walkers do not collect them again: its directory or the postgres:// URL of its store. With --part, give it to `calm merge`
+    /// Also update the mixture with the accepted candidates of this campaign that have no label (pending, failed, dropped or excluded), so
+    /// that walkers do not collect them again: its directory or the postgres:// URL of its store. With --part, give it to `calm merge`
     #[arg(long, value_name = "DIR", conflicts_with = "pass")]
     campaign: Option<PathBuf>,
     /// Candidate numbers of components per element, ascending; the build chooses one for each element
@@ -71,8 +72,8 @@ pub struct CalmBuildArgs {
     /// Threads; each takes whole shards [default: all cores]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Disk space beside the output for features, GB: passes 2 and 3 read there what pass 1 computed, and compute what does not fit.
-    /// With --part, the limit applies to each process. 0 keeps nothing
+    /// Disk space beside the output for features, GB. Passes 2 and 3 read the features of pass 1 there, and compute those that do not fit.
+    /// With --part, the limit applies to each process. 0 stores none
     #[arg(long, value_name = "GB", default_value_t = BuildDefaults::MAX_FEATURE_BYTES as f64 / 1e9, value_parser = gigabytes)]
     max_feature_cache: f64,
     /// Discard the saved state and start from pass 1
@@ -183,7 +184,7 @@ fn end_part(pass: u8, part: BuildPart, done: bool) -> Result<ExitStatus, Command
     Ok(ExitStatus::Done)
 }
 
-/// Says that the build goes on later.
+/// Says how to continue the build.
 pub(super) fn stopped() -> ExitStatus {
     print_stderr("stopped; the same command continues");
     ExitStatus::Interrupted

@@ -22,9 +22,9 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
 /// Compare the grades of two CALM artifacts of one model on the same structures
 ///
-/// For each element: median and 99 % quantile of γ under both artifacts, the share of atoms with γ > 1 under A, under B, and under
-/// only one of them, and the rank correlation ρ of the two grades (Spearman). Shares count every atom; quantiles and ρ come from a sample of
-/// 50,000 atoms at most.
+/// Shows for each element the median and 99 % quantile of γ under both artifacts, the share of atoms with γ > 1 under A, under B, and under
+/// only one of them, and the rank correlation ρ of the two grades (Spearman). Shares count every atom; quantiles and ρ come from a sample
+/// of at most 50,000 atoms.
 #[derive(Debug, clap::Args)]
 pub struct CalmCompareArgs {
     /// GRACE model (kokkos.npz) that both artifacts belong to

@@ -18,13 +18,13 @@ use crate::versions::{self, VersionOnDisk};
 
 /// Write the mixture of a campaign, at any version, as a CALM artifact
 ///
-/// The artifact is a copy of the one the campaign began with, with the covariances and counts that updates have changed since. Use it
-/// to grade structures by what the campaign has covered, with calm score, gracemaker or LAMMPS, or to begin another campaign. Reads
-/// the campaign only, which may be running.
+/// The artifact is a copy of the campaign's original one with the covariances and counts that updates have changed since. Use it to grade
+/// structures by what the campaign has covered, with calm score, gracemaker or LAMMPS, or to start another campaign. Only reads, and
+/// works while the campaign runs.
 ///
-/// The store has the newest version. Earlier ones are computed from the accepted candidates, whose features are always stored, and every
-/// update must be as recorded. Version 0 is the original mixture. The mixture of a new version of the potential has the version that
-/// the decision log gives it. Numbers are rounded to single precision, as in every artifact.
+/// The store has the newest version. calmwalk computes earlier ones from the accepted candidates, and checks that every update is as
+/// recorded. Version 0 is the original mixture. The mixture of a new version of the potential has the number that the decision log gives
+/// it. Numbers are rounded to single precision, as in every artifact.
 #[derive(Debug, clap::Args)]
 pub struct CalmExportArgs {
     #[command(flatten)]

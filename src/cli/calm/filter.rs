@@ -15,12 +15,12 @@ use crate::reliability_filter::{self, ErrorColumns, FilterReport, InputColumns};
 /// Resolution of a PNG, dots per inch.
 const RESOLUTION: f64 = 300.0;
 
-/// Show what a threshold of the grade keeps of a table of structures, against random subsets
+/// Compare structures below a threshold of the grade with random subsets
 ///
-/// For each threshold: the structures with at most this grade, their mean absolute error and, with --class-threshold, precision,
-/// recall and F1 of membership of a class, such as the stable structures of Matbench Discovery. Beside each number: mean and standard
-/// deviation over random subsets of the same size, drawn without replacement. A grade that predicts errors makes the kept structures
-/// better than these.
+/// For each threshold, shows how many structures have at most this grade, and their mean absolute error. With --class-threshold, also
+/// shows precision, recall and F1 for a class, such as the stable structures of Matbench Discovery. Beside each number are mean and
+/// standard deviation over random subsets of the same size. If the grade predicts errors, the structures below the threshold have
+/// smaller errors than these subsets.
 ///
 /// With --output, also writes a self-contained HTML page with the errors by grade and this sweep, each figure as SVG, PNG and CSV, the
 /// table as CSV, and all results as JSON.
@@ -44,10 +44,10 @@ pub struct CalmFilterArgs {
     /// Column of the true value
     #[arg(long = "true", value_name = "COLUMN", requires = "predicted")]
     actual: Option<String>,
-    /// A structure is in the class if its value is at most this, as an energy above the hull of 0; in the unit of the values
+    /// Structures with a value up to this are in the class, such as 0 for the energy above the hull; in the unit of the values
     #[arg(long, value_name = "VALUE", conflicts_with = "error", allow_negative_numbers = true, value_parser = finite)]
     class_threshold: Option<f64>,
-    /// A structure is in the class if its value is larger than --class-threshold
+    /// Structures with a value above --class-threshold are in the class
     #[arg(long, requires = "class_threshold")]
     class_above: bool,
     /// Thresholds of the grade

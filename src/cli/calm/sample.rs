@@ -22,26 +22,26 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
 /// Draw a weighted sample of structures that stands for a data set of any size
 ///
-/// Draws whole structures at random, without replacement, so that the sample has about N atoms of each element, or all there are. An
-/// element draws at least N atoms, and fewer than N plus those of its largest structure. A structure drawn for one
-/// element also counts for the others in it, so frequent elements get more.
+/// Draws whole structures at random, without replacement, until the sample has about N atoms of each element, or all there are. A structure
+/// drawn for one element also counts for its other elements, so frequent elements get more.
 ///
-/// Writes each structure as it is, with its labels and with calmwalk_weight: the number of structures of the data that it stands for.
-/// `calm build` and `upfit` multiply it by --weight of the file. Weighted sums over the sample are those over the data, up to the
-/// random error of the sample.
+/// Writes each structure with its labels and adds calmwalk_weight: the number of structures of the data that it stands for. `calm build` and
+/// `upfit` multiply it by --weight of the file. Up to the random error of the sample, weighted sums over the sample equal the sums over the
+/// data.
 ///
-/// Reads the data once and keeps the sample in memory only. The sample depends on --rng-seed and on the order of the structures.
+/// Reads the data once, and keeps only the sample in memory. The sample depends on --rng-seed and on the order of the structures.
 #[derive(Debug, clap::Args)]
 pub struct CalmSampleArgs {
     #[command(flatten)]
     data: StructureArgs,
-    /// Atoms of each element; several times those of a structure, and more than the D + 1 that a component of a mixture needs
+    /// Number of atoms of each element. Choose several times the atoms of a structure, and more than the D + 1 that a component of a mixture
+    /// needs
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     atoms_per_element: u64,
     /// File for the sample, extended XYZ; an existing file is replaced at the end
     #[arg(long, short, value_name = "SAMPLE.extxyz")]
     output: PathBuf,
-    /// GRACE model (kokkos.npz): also name the elements with fewer than D + 1 atoms in the sample, also elements of the model without data
+    /// GRACE model (kokkos.npz): also list its elements with fewer than D + 1 atoms in the sample, including those without data
     #[arg(long, value_name = "MODEL.npz")]
     model: Option<PathBuf>,
     /// Random seed

@@ -31,8 +31,8 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 /// Writes every frame with the model's energy (eV), forces (eV/Å) and, for periodic cells, stress (eV/Å³, tension positive),
 /// and per atom gamma (extrapolation grade γ), gamma_nbr (its neighbourhood average), sigma (Mahalanobis distance σ) and
 /// component (nearest component of the atom's element, from 0). Refuses structures with atoms closer than 0.4 Å, and mixtures
-/// that cannot come from training data. With an artifact of other features of the model (`calm build --feature-variant`), those are
-/// graded.
+/// that cannot come from training data. With an artifact of other features of the model (`calm build --feature-variant`), grades those
+/// features.
 ///
 /// With --baseline, it also writes the scores of baselines (`calmwalk calm baseline`), such as llpr, each with its neighbourhood
 /// average (llpr_nbr). With --ensemble, force_deviation is the norm of the standard deviation of the forces of all models (eV/Å).
@@ -65,7 +65,7 @@ pub struct CalmScoreArgs {
     /// Also write the scores of this file of baselines (`calmwalk calm baseline`); may be repeated
     #[arg(long, value_name = "BASELINES.npz")]
     baseline: Vec<PathBuf>,
-    /// Also write the disagreement of the forces with those of this model; may be repeated
+    /// Also write the disagreement of the forces with those of this model, independently trained; may be repeated
     #[arg(long, value_name = "MODEL.npz")]
     ensemble: Vec<PathBuf>,
     /// Also write a neighbour average of γ with weights of your choice, as gamma_nbr_uniform and so on; may be repeated.
@@ -73,7 +73,7 @@ pub struct CalmScoreArgs {
     /// model's cutoff, such as uniform:3.2
     #[arg(long, value_name = "WEIGHTS[:RADIUS]")]
     gamma_nbr: Vec<NeighbourWeights>,
-    /// Also write the statistics of labelled structures to this file, with all thresholds of the force error
+    /// Also write the statistics of labelled structures to this file, for all thresholds of the force error
     #[arg(long, value_name = "FILE.json")]
     json: Option<PathBuf>,
     /// Also draw the statistics of labelled structures into this directory: force errors by grade and on either side of its
@@ -84,9 +84,9 @@ pub struct CalmScoreArgs {
     /// atom of the model and of the label (eV), mean and largest force error (eV/Å)
     #[arg(long, value_name = "FILE.csv")]
     table: Option<PathBuf>,
-    /// Also write force_error_bound (eV/Å) of each structure: what 90 % of the force errors of its worst atom, that with the largest
-    /// gamma_nbr, are expected to be below, from the labels of this campaign, or of a file that `calmwalk force-errors
-    /// --calibration` wrote. Model and artifact must be those of a version of its potential
+    /// Also write force_error_bound (eV/Å) of each structure: 90 % of the force errors of its worst atom (largest gamma_nbr) are expected
+    /// to be below it. calmwalk learns it from the labels of this campaign, or reads it from a file of `calmwalk force-errors
+    /// --calibration`. Model and artifact must be those of a version of the campaign's potential
     #[arg(long, value_name = "DIR|FILE.json")]
     calibration: Option<PathBuf>,
 }

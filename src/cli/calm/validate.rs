@@ -33,10 +33,16 @@ const MIXED: usize = 4;
 
 /// Test whether the extrapolation grade of a model can be trusted, with and without labels
 ///
-/// Bond scans of the elements' crystals from compression to stretching, as the paper's minimal test; grades at vacancies, surfaces and
-/// grain boundaries; grades of random solid solutions against composition; searches for different environments with the same features.
-/// With --labelled, also how well the grade ranks the force errors of labelled structures, as calm score says. Run it after calm build,
-/// and before a campaign trusts γ.
+/// Run it after calm build, before you rely on γ in a campaign. It tests
+///
+/// - bond scans of the elements' crystals from compression to stretching, the paper's minimal test;
+///
+/// - grades at vacancies, surfaces and grain boundaries, and of random solid solutions against composition;
+///
+/// - whether different environments have the same features;
+///
+/// - with --labelled, how well the grade ranks the force errors of labelled structures, as calm score does.
+///
 /// Writes a self-contained HTML page, each figure as SVG, PNG and CSV, each table as CSV, all results as JSON, and the graded
 /// structures. The same input gives the same bytes. docs/calm-validation.md explains the tests.
 ///

@@ -23,16 +23,23 @@ const SHOWN: usize = 20;
 
 /// Show the full history of one candidate
 ///
-/// Shows the atoms that triggered it, its grades under the walker's, the selector's and the original mixture, the decision with
-/// its rule and numbers, every value of α that was tried, the attempts at its label with their costs, the error of the
-/// potential beside the one expected from earlier labels, and the later candidates that it covered. For control frames and imported structures, shows what is
-/// recorded. Works while the campaign runs and on backups.
+/// Shows
+///
+/// - the atoms that triggered it, and its grades under the walker's, the selector's and the original mixture;
+///
+/// - the decision with its rule and numbers, every value of α that the update tried, and the later candidates that it covered;
+///
+/// - the attempts at its label with their costs;
+///
+/// - the error of the potential beside the one expected from earlier labels.
+///
+/// For control frames and imported structures, shows what is recorded. Works while the campaign runs and on backups.
 #[derive(Debug, clap::Args)]
 pub struct ExplainArgs {
     #[command(flatten)]
     location: CampaignArgs,
-    /// Candidate: its id or a unique prefix of it (the campaign part can be omitted), or the number of its decision; or
-    /// import-N for an imported structure
+    /// Id of a candidate or a unique prefix of it (you may omit the campaign part), number of its decision, or import-N for an imported
+    /// structure
     id: String,
     /// Print JSON, with the grades of every atom (docs/explain.md)
     #[arg(long)]

@@ -24,14 +24,20 @@ const BAR: &str = "{spinner} {pos} structures";
 
 /// Write the labelled structures to an extended XYZ file
 ///
-/// Structures are in the order of the decisions, whenever their labels were computed: the same campaign gives the same bytes.
-/// In addition to the label, each frame has campaign, candidate_id, seed_structure, walk, segment, step, origin,
-/// mixture_version (after the decision), mixture_version_seen (by the walker), protocol, protocol_hash and relative_volume
-/// (V/V₀), and per atom gamma and gamma_nbr under the original mixture; in a campaign with several versions of the potential also
-/// calmwalk_version, that of the walk, and grades of different versions cannot be compared. Imported structures have
-/// source_file and source_frame (from 0) instead. If the calculation provides them, there are also energy_without_smearing (eV), magmom (magnetic moment of
-/// the cell, μ_B) and per atom magmoms (μ_B). Fails without writing a file if the database is damaged or incomplete. See
-/// docs/export.md.
+/// Structures are in the order of the decisions, whenever their labels were computed: the same campaign gives the same bytes. Each frame
+/// has its label and
+///
+/// - where it comes from: campaign, candidate_id, seed_structure, walk, segment, step and origin; an imported structure has source_file
+///   and source_frame (from 0) instead;
+///
+/// - mixture_version (after the decision), mixture_version_seen (by the walker), protocol, protocol_hash and relative_volume (V/V₀);
+///
+/// - per atom gamma and gamma_nbr under the original mixture;
+///
+/// - if the calculation provides them: energy_without_smearing (eV), magmom (magnetic moment of the cell, μ_B) and per atom magmoms (μ_B).
+///
+/// With several versions of the potential, calmwalk_version is the version that drove the walk. Do not compare grades of different
+/// versions. Fails without writing a file if the database is damaged or incomplete. See docs/export.md.
 #[derive(Debug, clap::Args)]
 pub struct ExportArgs {
     #[command(flatten)]
@@ -50,18 +56,21 @@ pub struct ExportArgs {
     imported: bool,
     /// Export only structures that match a filter, such as 'gamma > 2 and element = Mo'
     ///
-    /// Combine comparisons with and, or, not and parentheses. Numbers (= != < <= > >=): gamma, gamma_nbr (largest of the
-    /// structure, original mixture), relative_volume (V/V₀), kinetic_temperature (of the structure, K), temperature (K), tau and
-    /// version (of the potential; all of the walk), walk, step, mixture_version (after the decision), atoms, energy (eV, label),
-    /// energy_per_atom (eV, label), max_force (eV/Å, label). Texts (= !=): element (any atom of the structure), origin (biased, control or imported),
-    /// seed_structure (its name, in quotes if it contains spaces), group (of the walk, see [[walks]]), retry_adjustment (any of
-    /// those with which the label was computed after failures, such as other_moments). A comparison with a missing value is false.
+    /// Combine comparisons with and, or, not and parentheses. A comparison with a missing value is false.
+    ///
+    /// Numbers of the structure (= != < <= > >=): gamma and gamma_nbr (largest of its atoms, original mixture), relative_volume (V/V₀),
+    /// kinetic_temperature (K), atoms, mixture_version (after the decision). Of its walk: walk, step, temperature (K), tau, version (of the
+    /// potential). Of its label: energy (eV), energy_per_atom (eV), max_force (eV/Å).
+    ///
+    /// Texts (= !=): element (any atom of the structure), origin (biased, control or imported), seed_structure (its name, in quotes if it
+    /// contains spaces), group (of the walk, see [[walks]]), retry_adjustment (any of those with which the label was computed after
+    /// failures, such as other_moments).
     #[arg(long = "where", value_name = "FILTER")]
     condition: Option<StructureFilter>,
     /// Split into several files, such as train=0.9,test=0.1 for FILE-train and FILE-test
     ///
-    /// Assigns the seed structures at random to the files in these proportions. All structures found from one seed structure go
-    /// to the same file, which keeps training and test sets independent. Imported structures go to the first file.
+    /// Assigns the seed structures to the files at random, in these proportions. All structures found from one seed structure go to the
+    /// same file, which keeps training and test sets independent. Imported structures go to the first file.
     #[arg(long, value_name = "NAME=SHARE,…")]
     split: Option<Shares>,
     /// Random seed of the split

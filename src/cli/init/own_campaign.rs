@@ -11,7 +11,8 @@ pub struct OwnCampaignArgs {
     /// GRACE model that drives the walks (kokkos.npz)
     #[arg(long, value_name = "MODEL.npz")]
     pub model: Option<PathBuf>,
-    /// Its CALM artifact (gmm_artifacts.npz). Without one, the mixture of the model grades structures but is not updated
+    /// CALM artifact of the model (gmm_artifacts.npz). Without it, the mixture in the model file grades structures, but calmwalk cannot
+    /// update it
     #[arg(long, value_name = "ARTIFACT.npz")]
     pub artifact: Option<PathBuf>,
     /// Seed structures, extended XYZ or POSCAR

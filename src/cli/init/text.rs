@@ -16,9 +16,9 @@ const BIASED_STEPS: u64 = 15_000;
 
 /// What closes the loop, for users who have labelled structures that the potential knows.
 const REFIT: &str =
-    "# [refit]                       # train the potential from the labels, and go on with it (docs/refit.md)
+    "# [refit]                       # train the potential from the labels, and continue with it (docs/refit.md)
 # replay = [\"train.extxyz\"]     # labelled structures that it knows: its training data, or a sample of them
-# after_structures = 50         # train when so many more structures are accepted";
+# after_structures = 50         # train when this many more structures are accepted";
 
 /// The text of the configuration in `directory`.
 ///
@@ -236,7 +236,7 @@ fn full_text(template: &str, mut sections: Vec<WrittenSection>) -> String {
 fn filled(block: &str, mut keys: Vec<WrittenKey>) -> String {
     let (mut lines, mut is_replaced) = (Vec::new(), false);
     for line in block.lines() {
-        // The comment of the line above goes on.
+        // The comment of the line above continues.
         if line.starts_with("   ") {
             if !is_replaced {
                 lines.push(line.to_owned());

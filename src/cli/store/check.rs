@@ -11,11 +11,18 @@ const BAR: &str = "checking {bar:32} {pos}/{len} rows  {eta} left";
 
 /// Check the integrity of a campaign's store
 ///
-/// Runs the integrity check of the database, then verifies that the decision log has no gaps, each accepted candidate has a
-/// decision and a label job, labels belong to their jobs, contents match their hashes, components are readable, archived
-/// calculation directories can be unpacked, no dead process holds a lease, and every row with numbers matches its checksum.
-/// Only reads, also while the campaign runs. Prints each finding with its meaning and what to do; the exit code is 1 if there are
-/// any.
+/// Runs the integrity check of the database, then verifies that
+///
+/// - the decision log has no gaps, and each accepted candidate has a decision and a label job;
+///
+/// - labels belong to their jobs, contents match their hashes, and every row with numbers matches its checksum;
+///
+/// - components are readable, and archived calculation directories can be unpacked;
+///
+/// - no dead process holds a lease.
+///
+/// Prints each problem with its meaning and what to do; the exit code is 1 if there are any. Only reads, and works while the campaign
+/// runs.
 #[derive(Debug, clap::Args)]
 pub struct StoreCheckArgs {
     #[command(flatten)]

@@ -11,14 +11,14 @@ use crate::output::{print, print_json};
 
 /// Compare the errors of two versions
 ///
-/// Compares them on the data sets that both were judged by. If one is version 0 or the parent of the other, both were evaluated on
-/// the same structures. Otherwise, a set that has grown in between, such as the held-out labels, is left out.
+/// Compares them on the data sets on which both were judged. If one is version 0 or the parent of the other, the refit evaluated both
+/// on the same structures. Otherwise, leaves out sets that have grown in between, such as the held-out labels.
 #[derive(Debug, clap::Args)]
 pub struct VersionsCompareArgs {
-    /// Number of a version; 0 is that of the configuration
+    /// Number of a version; 0 is the potential of the configuration
     #[arg(value_name = "A")]
     one: u32,
-    /// Number of the other
+    /// Number of the other version
     #[arg(value_name = "B")]
     other: u32,
 }
@@ -60,7 +60,7 @@ fn write(
 ) -> io::Result<()> {
     let [one, other] = numbers.map(|number| format!("version {number}"));
     if pairs.is_empty() {
-        writeln!(out, "there is no data set that both versions were judged by")?;
+        writeln!(out, "the two versions have no data set in common")?;
     } else {
         table([&one, &other], pairs).write(out)?;
     }
@@ -73,7 +73,7 @@ fn write(
     }
     for (name, sets) in [&one, &other].into_iter().zip(only_in(numbers, versions, pairs)) {
         if !sets.is_empty() {
-            writeln!(out, "only {name} was judged by: {}", sets.join(", "))?;
+            writeln!(out, "only {name} was judged on: {}", sets.join(", "))?;
         }
     }
     Ok(())

@@ -18,12 +18,12 @@ use crate::versions::{MIXTURE_FILE, MODEL_FILE};
 
 /// Write the files of a version: its model and the artifact of its mixture
 ///
-/// Writes kokkos.npz and gmm_artifacts.npz, byte for byte as the store has them; of version 0, copies of the campaign's files. The
-/// mixture is that with which the walks of the version began; calm export writes it with the updates since. Never replaces a file
-/// that has another content.
+/// Writes kokkos.npz and gmm_artifacts.npz, byte for byte as the store has them; for version 0, copies of the campaign's files. The mixture
+/// is the one with which the walks of the version began; `calmwalk calm export` writes it with the updates since. Never replaces a file
+/// with other content.
 #[derive(Debug, clap::Args)]
 pub struct VersionsExportArgs {
-    /// Number of the version; 0 is that of the configuration
+    /// Number of the version; 0 is the potential of the configuration
     #[arg(value_name = "N")]
     number: u32,
     /// Directory for the files; created if it does not exist
@@ -52,7 +52,7 @@ impl VersionsExportArgs {
             print(|out| {
                 outputs.iter().zip(written).try_for_each(|((path, _), written)| match written {
                     true => writeln!(out, "wrote {}", path.display()),
-                    false => writeln!(out, "{} is there already, with the same content", path.display()),
+                    false => writeln!(out, "{} already exists with the same content", path.display()),
                 })
             })?;
         }

@@ -73,7 +73,7 @@ fn write(out: &mut dyn Write, known: &KnownVersions) -> io::Result<()> {
     match known.not_taken_up() {
         Some(number) => writeln!(
             out,
-            "no walk runs with version {number} yet: calmwalk run takes it up, unless the campaign ends with it"
+            "no walk uses version {number} yet: calmwalk run switches to it, unless the campaign ends with it"
         ),
         None => Ok(()),
     }

@@ -15,8 +15,8 @@ use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 
 /// List the versions of a campaign's potential, compare or export them, or go back to one
 ///
-/// A version is a model with its mixture. Version 0 is that of the configuration; a campaign with [refit] trains further ones while
-/// it runs, which are in its store. A version that was refused has a number too, but no files. Without a subcommand, lists all.
+/// A version is a model with its mixture. Version 0 is that of the configuration. A campaign with [refit] trains further versions while it
+/// runs, and keeps them in its store. A refused version has a number too, but no files. Without a subcommand, lists all versions.
 #[derive(Debug, clap::Args)]
 pub struct VersionsArgs {
     #[command(flatten)]
@@ -68,7 +68,7 @@ fn read<T>(
 struct KnownVersions {
     /// Those from 1 on and refused attempts, by number.
     versions: Vec<VersionRecord>,
-    /// Number of the version that the decision log has taken up.
+    /// Number of the version that the decision log last switched to.
     taken_up: u32,
 }
 

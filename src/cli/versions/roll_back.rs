@@ -31,15 +31,15 @@ const CANDIDATES: u32 = 16;
 
 /// Go back to an earlier version: register its files as a new version
 ///
-/// Nothing is deleted: the version with the model of N gets the next number, and later refits train it further. Its mixture is that
-/// of N, updated with the structures that the campaign has accepted since N's training set was fixed, so that walks do not find
-/// them again. Labels, decisions and other versions stay.
+/// Registers the model of N under the next number; later refits train it further. Updates the mixture of N with the structures that the
+/// campaign has accepted since N's training set was fixed, so that walks do not find them again. Labels, decisions and other versions
+/// stay.
 ///
-/// A reproducible campaign must not be running. The next calmwalk run takes the version up, and starts every walk of its plan anew.
-/// A running live campaign takes it up within seconds.
+/// A reproducible campaign must not be running: the next calmwalk run switches to the version and restarts all walks from their seed
+/// structures. A running live campaign switches within seconds.
 #[derive(Debug, clap::Args)]
 pub struct VersionsRollBackArgs {
-    /// Number of the version to go back to; 0 is that of the configuration
+    /// Number of the version to go back to; 0 is the potential of the configuration
     #[arg(value_name = "N")]
     number: u32,
     #[command(flatten)]
@@ -221,12 +221,12 @@ impl RolledBack {
         }
         match mode {
             CampaignMode::Reproducible => {
-                writeln!(out, "the next calmwalk run starts every walk of the plan anew with it")
+                writeln!(out, "the next calmwalk run restarts all walks from their seed structures with it")
             }
             CampaignMode::Live => {
                 writeln!(
                     out,
-                    "every walk of the plan starts anew with it: at once if the campaign runs, else at the next calmwalk run"
+                    "all walks restart from their seed structures with it: at once if the campaign runs, else at the next calmwalk run"
                 )
             }
         }

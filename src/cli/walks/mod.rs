@@ -11,9 +11,9 @@ pub use trace::TraceArgs;
 
 /// Show or pause walks
 ///
-/// A walk pauses at the end of its current assignment (run.steps_per_assignment), and resumes from there. It stays paused when the
-/// campaign is stopped and resumed. In reproducible mode, the other walks of the same round wait for it, because decisions must
-/// not depend on when a walk was paused.
+/// A walk pauses at the end of its current assignment (run.steps_per_assignment), and resumes from there. It stays paused when you stop and
+/// resume the campaign. In reproducible mode, the other walks of the same round wait for it, because decisions must not depend on when
+/// you pause a walk.
 #[derive(Debug, clap::Args)]
 #[command(subcommand_required = true, arg_required_else_help = true)]
 pub struct WalksArgs {

@@ -41,7 +41,7 @@ pub struct TraceArgs {
     /// Number of the walk, as in calmwalk status
     #[arg(value_parser = walk_number)]
     walk: u32,
-    /// File for the points. Default: standard output
+    /// File for the points [default: standard output]
     #[arg(long, value_name = "FILE.csv")]
     output: Option<PathBuf>,
 }

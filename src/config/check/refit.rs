@@ -106,7 +106,7 @@ fn check_comparisons(config: &Config, refit: &RefitSection) -> Result<(), Invali
         return wrong(key, found, "\"train\": without campaign.control there are no control frames");
     }
     if refit.start != RefitStart::First || !matches!(refit.method, RefitMethod::Native(_)) {
-        let expected = "refit.start = \"first\" and refit.method = { native = … } beside it: models are compared that begin with \
+        let expected = "refit.start = \"first\" and refit.method = { native = … } beside it: the compared models must start from \
                         the same weights and have the same training";
         return wrong(key, found, expected);
     }

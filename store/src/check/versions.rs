@@ -34,7 +34,7 @@ const RULES: [ConsistencyRule; 3] = [
     },
 ];
 
-/// The decisions that took up versions, in order.
+/// The decisions that switch to versions, in order.
 const TAKEN_UP: &str = "SELECT sequence, detail FROM decision WHERE kind = 'version' ORDER BY sequence";
 const CONDITIONS: &str = "SELECT walk, conditions FROM walk_conditions ORDER BY walk";
 
@@ -51,7 +51,7 @@ pub(super) async fn rules(transaction: &mut Transaction) -> Result<Vec<Finding>>
     Ok(findings)
 }
 
-/// The versions that the log takes up. Adds a finding for each that is not registered with these
+/// The versions that the log switches to. Adds a finding for each that is not registered with these
 /// files, or not newer than the one before.
 async fn taken_up(transaction: &mut Transaction, findings: &mut Vec<Finding>) -> Result<BTreeSet<u64>> {
     const HASHES: &str =
@@ -75,7 +75,7 @@ async fn taken_up(transaction: &mut Transaction, findings: &mut Vec<Finding>) ->
         };
         if let Some(problem) = problem {
             let what =
-                format!("decision {sequence} takes up version {number} of the potential, which {problem}");
+                format!("decision {sequence} switches to version {number} of the potential, which {problem}");
             findings.push(Finding { what, then: LOST });
         }
         last = last.max(number);
@@ -84,7 +84,7 @@ async fn taken_up(transaction: &mut Transaction, findings: &mut Vec<Finding>) ->
     Ok(taken_up)
 }
 
-/// Checks that walks run with versions that the log has taken up.
+/// Checks that walks run with versions that the log has switched to.
 async fn walks(transaction: &mut Transaction, taken_up: &BTreeSet<u64>) -> Result<Option<Finding>> {
     if !transaction.has_table("walk_conditions").await? {
         return Ok(None);
@@ -101,7 +101,7 @@ async fn walks(transaction: &mut Transaction, taken_up: &BTreeSet<u64>) -> Resul
     let wrong: Vec<_> = conditions.iter().filter(is_wrong).collect();
     Ok(wrong.first().map(|(walk, _)| Finding {
         what: format!(
-            "{} walks with versions of the potential that no decision takes up (such as {walk})",
+            "{} walks with versions of the potential that no decision switches to (such as {walk})",
             wrong.len()
         ),
         then: LOST,

@@ -259,7 +259,7 @@ impl Store {
 
     /// Ends every lease of `process` and of its parts after a crash of that process. Each counts as a failed
     /// attempt of that class, and a job with `attempt_limit` of them fails. An attempt whose calculation is a
-    /// process of its own counts only as lost: the calculation goes on. Returns the number of leases.
+    /// process of its own counts only as lost: the calculation continues. Returns the number of leases.
     pub async fn fail_leases_of(
         &self,
         process: &str,

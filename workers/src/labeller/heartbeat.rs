@@ -89,7 +89,7 @@ async fn send_heartbeat(
     let is_over = match exit_policy {
         _ if led => false,
         ExitPolicy::UntilEmpty => true,
-        // Walks go on after a refit, which the next run makes.
+        // Walks continue after a refit, which the next run makes.
         ExitPolicy::UntilFinished => store.all_walks_ended().await? && !is_refit_due(store).await?,
     };
     shutdown.set_no_more_jobs(is_over);

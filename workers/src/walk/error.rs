@@ -6,7 +6,7 @@ use potentials::ZblRangeError;
 
 use crate::bias::UngradedError;
 
-/// Why a walk cannot go on.
+/// Why a walk cannot continue.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum WalkError {
     #[error(transparent)]

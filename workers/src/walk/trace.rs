@@ -44,7 +44,7 @@ impl RunningWalk<'_> {
         let gamma_max = match gamma(&mut self.potential, &self.dynamics).map_err(WalkError::from) {
             Ok(gamma) => Some(maximum(gamma)),
             Err(WalkError::Unavailable(reason)) => return Err(WalkError::Unavailable(reason)),
-            // The walk goes on, or ends where its grades are needed.
+            // The walk continues, or ends where its grades are needed.
             Err(_) => None,
         };
         let pressure = self.dynamics.pressure_tensor();

@@ -17,18 +17,18 @@ pub struct CustomScheduler {
     /// Shell command that submits a job. `{script}` is the file of the job's script, which the command also gets on its standard
     /// input; `{start_after}` is the text of that key, or nothing for a job that waits for no other.
     pub submit: String,
-    /// Text in the output of `submit` after which the id of the job stands. Default: the id comes first.
+    /// Text that precedes the id of the job in the output of `submit`. Default: the id comes first.
     #[serde(default)]
     pub id_after: String,
     /// Option with which a job starts only after the job `{id}` has started. Default: jobs wait for no other.
     #[serde(default)]
     pub start_after: String,
-    /// Texts in the output of `submit` that say that no further job is accepted for now.
+    /// Texts in the output of `submit` that say that the batch system accepts no further job for now.
     #[serde(default)]
     pub queue_full: Vec<String>,
     /// Shell command that prints the state of the job `{id}`.
     pub poll: String,
-    /// Text in the output of `poll` after which the word for the state stands. Default: the word comes first.
+    /// Text that precedes the word for the state in the output of `poll`. Default: the word comes first.
     #[serde(default)]
     pub state_after: String,
     /// Words for the states of a job. A job with any other word counts as running.
