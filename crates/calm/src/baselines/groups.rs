@@ -23,11 +23,14 @@ impl AtomGroups {
         Self { dimension, centroids }
     }
 
-    /// One group for each component.
+    /// One group for each component with atoms. An element without atoms has no centroid: that of
+    /// [`crate::Component::unknown_element`] has no meaning.
     pub fn of_components(mixture: &Mixture) -> Self {
         let mut centroids = vec![Vec::new(); mixture.element_count()];
         for (element, _, component) in mixture.iter() {
-            centroids[element].extend_from_slice(component.centroid());
+            if component.statistics().is_none_or(|statistics| statistics.count > 0.0) {
+                centroids[element].extend_from_slice(component.centroid());
+            }
         }
         Self { dimension: mixture.dimension(), centroids }
     }
