@@ -39,7 +39,8 @@ use crate::structure_files::StructureReadingArgs;
 ///
 /// Writes what the frames had, with selection_strategy, selection_rank (from 1), gamma_max (at the pick), and source_file and
 /// source_frame (from 0), or campaign, candidate_id and fate. `calmwalk import --queue` brings them into a campaign for labelling. Reads
-/// files twice and keeps the features of atoms within the window only; see docs/select.md.
+/// files twice and keeps the features of atoms within the window only; see docs/select.md. Leaves out structures that cannot be graded
+/// (an element that the model does not have, atoms closer than 0.4 Å), with a warning.
 #[derive(Debug, clap::Args)]
 pub struct SelectArgs {
     /// GRACE model (kokkos.npz)
@@ -410,6 +411,7 @@ impl SelectionReport<'_> {
                 "features_computed": self.pool.evaluated,
                 "features_from_stores": pool.len() as u64 - self.pool.evaluated,
                 "candidates_left_out": self.left_out(),
+                "ungraded": self.pool.left_out.count(),
             },
             "strategies": strategies.collect::<Vec<_>>(),
             "elements": elements.collect::<Vec<_>>(),
