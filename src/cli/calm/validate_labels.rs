@@ -65,8 +65,7 @@ pub fn set(
     }
     for by in comparison.models {
         let Some(report) = graded(by)? else { return Ok(None) };
-        let model = by.file.display().to_string();
-        models.extend(report.average().cloned().map(|average| ComparedModel { model, average }));
+        models.extend(ComparedModel::new(by.file.display().to_string(), &report));
     }
     Ok(Some(LabelledSet { file: input.display().to_string(), report, mixtures, models }))
 }
