@@ -4,6 +4,9 @@ use super::error::{BaselineError, check_element};
 use crate::grade::nearest;
 use crate::mixture::Mixture;
 
+/// Atoms of a group that are visited together: their rows, and products of these, stay in the cache.
+const BLOCK_ROWS: usize = 256;
+
 /// The groups, those of the first element first.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct AtomGroups {
@@ -79,7 +82,8 @@ impl AtomGroups {
     }
 }
 
-/// Calls `visit` with each group that has atoms, the indices of its atoms, and their rows `[atoms × D]`.
+/// Calls `visit` with each group that has atoms, the indices of its atoms, and their rows `[atoms × D]`; several times with a group of more
+/// than [`BLOCK_ROWS`] atoms.
 pub(super) fn for_each_group(
     groups: &[usize],
     dimension: usize,
@@ -89,7 +93,8 @@ pub(super) fn for_each_group(
     let mut order: Vec<usize> = (0..groups.len()).collect();
     order.sort_by_key(|&atom| groups[atom]);
     let mut rows = Vec::new();
-    for atoms in order.chunk_by(|&a, &b| groups[a] == groups[b]) {
+    let all = order.chunk_by(|&a, &b| groups[a] == groups[b]);
+    for atoms in all.flat_map(|atoms| atoms.chunks(BLOCK_ROWS)) {
         rows.clear();
         atoms.iter().for_each(|atom| rows.extend_from_slice(&features[atom * dimension..][..dimension]));
         visit(groups[atoms[0]], atoms, &mut rows);
