@@ -1,5 +1,6 @@
 //! Output files that appear complete or not at all.
 
+use std::collections::BTreeMap;
 use std::fs::{self, File, Permissions};
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::os::unix::fs::PermissionsExt;
@@ -89,6 +90,38 @@ pub fn refuse_to_replace<'a>(
     }
 }
 
+/// Checks the outputs of a command before its work: they can be written, and replace neither an input, which comes with a description, nor
+/// each other. Two names of one file are recognised.
+pub fn check_outputs<'a>(
+    outputs: impl IntoIterator<Item = &'a Path>,
+    inputs: &[(&Path, &str)],
+) -> Result<(), CommandError> {
+    let mut known = BTreeMap::new();
+    for output in outputs {
+        refuse_to_replace(output, inputs.iter().copied())?;
+        if let Some(other) = known.insert(resolved(output), output)
+            && !fs::metadata(output).is_ok_and(|found| !found.is_file())
+        {
+            let (output, other) = (output.display(), other.display());
+            return Err(CommandError::Input(format!(
+                "{output} and {other}: one file is named for two outputs"
+            )));
+        }
+        AtomicFile::create(output).map(drop)?;
+    }
+    Ok(())
+}
+
+/// The absolute path without symbolic links. The file need not exist.
+pub fn resolved(path: &Path) -> PathBuf {
+    let of_new = || {
+        let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+        let parent = parent.unwrap_or(Path::new(".")).canonicalize().ok()?;
+        Some(parent.join(path.file_name()?))
+    };
+    path.canonicalize().ok().or_else(of_new).unwrap_or_else(|| path.to_owned())
+}
+
 impl Write for AtomicFile {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.file.write(bytes)
@@ -107,6 +140,8 @@ impl Seek for AtomicFile {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::symlink;
+
     use super::*;
 
     #[test]
@@ -132,5 +167,32 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         assert!(AtomicFile::create(directory.path()).is_err());
         assert!(AtomicFile::create(&directory.path().join("missing/out")).is_err());
+    }
+
+    #[test]
+    fn names_of_one_file_are_recognised() {
+        let directory = tempfile::tempdir().unwrap();
+        let here = |name: &str| directory.path().join(name);
+        fs::create_dir(here("data")).unwrap();
+        fs::write(here("data/a.xyz"), "").unwrap();
+        symlink(here("data/a.xyz"), here("link.xyz")).unwrap();
+        assert_eq!(resolved(&here("link.xyz")), resolved(&here("data/../data/a.xyz")));
+        // Files that do not exist yet.
+        assert_eq!(resolved(&here("new.npz")), resolved(&here("data/../new.npz")));
+        assert_ne!(resolved(&here("new.npz")), resolved(&here("other.npz")));
+
+        let check = |outputs: &[&str]| {
+            let outputs: Vec<_> = outputs.iter().map(|name| here(name)).collect();
+            let input = here("data/a.xyz");
+            check_outputs(outputs.iter().map(PathBuf::as_path), &[(&input, "the input")])
+                .map_err(|error| error.to_string())
+        };
+        assert_eq!(check(&["new.npz", "other.npz"]), Ok(()));
+        // A device can take several outputs.
+        assert_eq!(check(&["/dev/null", "/dev/null"]), Ok(()));
+        assert!(check(&["new.npz", "data/../new.npz"]).unwrap_err().contains("named for two outputs"));
+        assert!(check(&["new.npz", "link.xyz"]).unwrap_err().contains("is the input: name another file"));
+        assert!(check(&["missing/new.npz"]).is_err());
+        assert!(!here("new.npz").exists());
     }
 }

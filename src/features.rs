@@ -37,6 +37,13 @@ pub enum FeatureError {
     Coincident(usize, usize, f64),
 }
 
+impl FeatureError {
+    /// Whether other structures may have features: what cannot be evaluated is the structure.
+    pub fn is_of_structure(&self) -> bool {
+        !matches!(self, Self::Potential(PotentialError::Unavailable(_) | PotentialError::Cutoff { .. }))
+    }
+}
+
 impl FeatureCalculator {
     /// Computes on the calling thread.
     pub fn new(model: Arc<dyn ModelWithFeatures>) -> Self {

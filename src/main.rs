@@ -27,6 +27,7 @@ mod initial_mixture;
 mod label_method;
 mod label_setup;
 mod labelled_frames;
+mod left_out;
 mod loaded_model;
 mod log;
 mod mixture_build;

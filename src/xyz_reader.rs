@@ -1,10 +1,8 @@
 //! Reads the frames of a file one at a time, and their labels. Errors name the file.
 
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read};
+use std::io::BufReader;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use atoms::extxyz::{ExtxyzReader, Frame, FrameLabels};
 use atoms::{FileError, open_extxyz};
@@ -13,28 +11,14 @@ use store::records::{Label, LabelDetails};
 /// Reads an extended XYZ file frame by frame.
 pub struct XyzReader {
     path: PathBuf,
-    /// Length of the file, bytes. `None` for a pipe.
-    pub length: Option<u64>,
-    read: Arc<AtomicU64>,
-    reader: ExtxyzReader<Box<dyn BufRead>>,
+    reader: ExtxyzReader<BufReader<File>>,
 }
-
-/// Counts the bytes read.
-struct Counting(File, Arc<AtomicU64>);
 
 impl XyzReader {
     /// Opens the file.
     pub fn open(path: &Path) -> Result<Self, FileError> {
-        let file = open_extxyz(path)?;
-        let length = file.metadata().ok().filter(|found| found.is_file()).map(|found| found.len());
-        let read = Arc::new(AtomicU64::new(0));
-        let input: Box<dyn BufRead> = Box::new(BufReader::new(Counting(file, Arc::clone(&read))));
-        Ok(Self { path: path.to_owned(), length, read, reader: ExtxyzReader::new(input) })
-    }
-
-    /// Bytes read so far.
-    pub fn position(&self) -> u64 {
-        self.read.load(Ordering::Relaxed)
+        let reader = ExtxyzReader::new(BufReader::new(open_extxyz(path)?));
+        Ok(Self { path: path.to_owned(), reader })
     }
 }
 
@@ -48,14 +32,6 @@ impl Iterator for XyzReader {
             line: error.line,
             fault: error.kind,
         }))
-    }
-}
-
-impl Read for Counting {
-    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
-        let count = self.0.read(buffer)?;
-        self.1.fetch_add(count as u64, Ordering::Relaxed);
-        Ok(count)
     }
 }
 

@@ -11,6 +11,7 @@ use calm::Artifact;
 use calm::baselines::{Baseline, BaselineFile, BaselineKind};
 use npyz::NpyFile;
 
+use crate::common::npz::with_changed_arrays;
 use crate::common::{calmwalk, config, deviation, refuse, succeed, write_frames};
 
 const MODEL: &str = "data/al_eam_1l/kokkos.npz";
@@ -130,14 +131,34 @@ fn forces_have_uncertainties_and_ensembles_disagree() {
     write_frames(&here.join("in.extxyz"), &[cell(4.05, 0.0), cell(4.05, 0.6)]);
     let common = ["--kind", "llpr-forces", "--regularisation", "1e-6", "--feature-variant", "hidden"];
     baseline(here, &[&["f.npz"], &common[..]].concat());
-    let model = path(MODEL);
-    let frames = score(here, "in.extxyz", &["--baseline", "f.npz", "--ensemble", &model]);
+    let readout = |name: &str, numbers: &mut Vec<f64>| {
+        if name == "energy_mlp_W0" {
+            numbers.iter_mut().for_each(|number| *number *= 1.05);
+        }
+    };
+    std::fs::write(here.join("other.npz"), with_changed_arrays(&config(MODEL), readout)).unwrap();
+    let of_other = ["calm", "score", "--model", "other.npz", "in.extxyz", "--output", "other.extxyz"];
+    succeed(here, of_other);
+    let frames = score(here, "in.extxyz", &["--baseline", "f.npz", "--ensemble", "other.npz"]);
     // Forces of the first frame vanish by symmetry for any weights; those of the second are uncertain.
     let (still, moved) =
         (column(&frames[..1], "hidden_llpr_forces"), column(&frames[1..], "hidden_llpr_forces"));
     assert!(largest(&still) < 1e-6 * largest(&moved) && largest(&moved) > 0.0, "{still:?} {moved:?}");
-    assert!(column(&frames, "force_deviation").iter().all(|deviation| *deviation == 0.0));
-    assert!(column(&frames, "force_deviation_nbr").iter().all(|deviation| *deviation == 0.0));
+    // The standard deviation of two numbers is half their distance.
+    let others = read_extxyz(&here.join("other.extxyz")).unwrap();
+    let forces = |frames: &[Frame]| -> Vec<_> {
+        frames.iter().flat_map(|frame| frame.labels().unwrap().forces.unwrap()).collect()
+    };
+    let pairs = forces(&frames).into_iter().zip(forces(&others));
+    let expected: Vec<f64> = pairs.map(|(own, other)| 0.5 * norm(sub(own, other))).collect();
+    let found = column(&frames, "force_deviation");
+    assert!(largest(&expected) > 1e-3 && deviation(&found, &expected) < 1e-6, "{found:?} {expected:?}");
+    let average = largest(&column(&frames, "force_deviation_nbr"));
+    assert!(average > 0.0 && average <= largest(&found), "{average}");
+    // The model itself disagrees with nothing.
+    let model = path(MODEL);
+    let same = score(here, "in.extxyz", &["--ensemble", &model]);
+    assert!(column(&same, "force_deviation").iter().all(|deviation| *deviation == 0.0));
 }
 
 #[test]

@@ -217,6 +217,8 @@ fn what_cannot_be_exported_is_refused() {
     assert!(message.contains(&format!("versions 0 to {newest} so far")), "{message}");
     let message = refused(&["--output", "calm.npz"]);
     assert!(message.contains("calm.npz is the artifact of the campaign"), "{message}");
+    let message = refused(&["--output", "x.npz", "--embed", "x.npz"]);
+    assert!(message.contains("x.npz and x.npz: one file is named for two outputs"), "{message}");
     let model = config("data/al_eam_1l/kokkos.npz").display().to_string();
     let message = refused(&["--output", "x.npz", "--embed", &model]);
     assert!(message.contains("is the model of the campaign"), "{message}");

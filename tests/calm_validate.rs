@@ -7,6 +7,7 @@ use atoms::prototypes::Prototype;
 use atoms::read_extxyz;
 use serde_json::{Value, json};
 
+use crate::common::npz::with_changed_arrays;
 use crate::common::{config, deviation, refuse, succeed, write_frames};
 
 fn validate(directory: &Path, model: &str, output: &str, more: &[&str]) -> String {
@@ -190,7 +191,13 @@ fn solid_solutions_are_scanned_for_models_of_several_elements() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let model = config("data/ni_al_h_eam_1l/kokkos.npz");
-    let ensemble = ["--ensemble", model.to_str().unwrap()];
+    let readout = |name: &str, numbers: &mut Vec<f64>| {
+        if name == "energy_mlp_W0" {
+            numbers.iter_mut().for_each(|number| *number *= 1.05);
+        }
+    };
+    std::fs::write(here.join("other.npz"), with_changed_arrays(&model, readout)).unwrap();
+    let ensemble = ["--ensemble", "other.npz"];
     let only = [
         "--elements",
         "Ni",
@@ -208,25 +215,21 @@ fn solid_solutions_are_scanned_for_models_of_several_elements() {
     let [labelled, second] = [0, 1].map(|k| frames.iter().skip(k).step_by(9).cloned().collect::<Vec<_>>());
     write_frames(&here.join("labelled.extxyz"), &labelled);
     write_frames(&here.join("second.extxyz"), &second);
-    let labels = ["--labelled", "labelled.extxyz", "second.extxyz", "--training", "labelled.extxyz"];
-    let labels = [&labels[..], &["--compare-model", model.to_str().unwrap()]].concat();
+    let text = std::fs::read(here.join("labelled.extxyz")).unwrap();
+    std::fs::write(here.join("training.extxyz.zst"), zstd::encode_all(&text[..], 3).unwrap()).unwrap();
+    let labels = ["--labelled", "labelled.extxyz", "second.extxyz", "--training", "training.extxyz.zst"];
+    let labels = [&labels[..], &["--compare-model", "other.npz"]].concat();
     validate(here, "ni_al_h_eam_1l", "out", &[&only[..], &ensemble[..], &labels[..]].concat());
     let found = json(&here.join("out"));
     errors_are_divided(&found["labelled"][0]["report"], &labelled);
     errors_are_divided(&found["labelled"][1]["report"], &second);
-    sets_are_beside_each_other(&here.join("out"), &found);
+    sets_are_beside_each_other(here, &found);
+    energies_spread(here, &found);
     training_data_are_counted(&found, &labelled);
     let page = std::fs::read_to_string(here.join("out/validation.html")).unwrap();
     assert!(
         page.contains("id=\"figure-composition-errors\"") && page.contains("id=\"table-element-errors\"")
     );
-    // An ensemble of equal models has no spread anywhere.
-    let spread = &found["scores"][1];
-    assert_eq!(
-        (&spread["name"], &spread["detection"]["at_equilibrium"]),
-        (&"energy spread".into(), &0.0.into())
-    );
-    assert_eq!(spread["detection"]["compression"], Value::Bool(false));
     let solution = &found["solutions"][0];
     assert_eq!(
         (&solution["elements"], &solution["prototype"]),
@@ -242,14 +245,41 @@ fn solid_solutions_are_scanned_for_models_of_several_elements() {
     assert_eq!(atoms, 11 * 128);
 }
 
+/// The spread of the energies at defects is half the distance of those that `calm score` gives with either model.
+fn energies_spread(here: &Path, found: &Value) {
+    assert_eq!(found["scores"][1]["name"], "energy spread");
+    let model = config("data/ni_al_h_eam_1l/kokkos.npz").display().to_string();
+    let [own, other] = [model.as_str(), "other.npz"].map(|model| -> Vec<f64> {
+        let score = ["calm", "score", "--model", model, "out/structures.extxyz", "--output", "scored.extxyz"];
+        succeed(here, score);
+        let frames = read_extxyz(&here.join("scored.extxyz")).unwrap();
+        frames
+            .iter()
+            .map(|frame| frame.info["energy"].number().unwrap() / frame.structure.len() as f64)
+            .collect()
+    });
+    let defects = found["defects"].as_array().unwrap().iter().filter(|defect| defect["error"].is_null());
+    let spread: Vec<f64> = defects.map(|defect| defect["shells"][0]["scores"][1].as_f64().unwrap()).collect();
+    let expected: Vec<f64> = own.iter().zip(&other).map(|(own, other)| 0.5 * (own - other).abs()).collect();
+    assert!(expected.len() > 3 && expected.iter().all(|spread| *spread > 1e-5), "{expected:?}");
+    assert!(deviation(&spread, &expected) < 1e-6, "{spread:?} {expected:?}");
+}
+
 /// Two sets have figures and tables of their own, and common ones.
-fn sets_are_beside_each_other(output: &Path, found: &Value) {
+fn sets_are_beside_each_other(here: &Path, found: &Value) {
+    let output = &here.join("out");
     let sets = found["labelled"].as_array().unwrap();
     let files: Vec<_> = sets.iter().map(|set| &set["file"]).collect();
     assert_eq!(files, ["labelled.extxyz", "second.extxyz"]);
-    for set in sets {
-        // The same model once more.
-        assert_eq!(set["models"][0]["average"], set["report"]["scores"][1]);
+    for (set, file) in sets.iter().zip(["labelled.extxyz", "second.extxyz"]) {
+        // The other model has its own errors and its own grades.
+        let score =
+            ["calm", "score", "--model", "other.npz", file, "--output", "scored.extxyz", "--json", "o.json"];
+        succeed(here, score);
+        let expected = read_json(&here.join("o.json"));
+        let other = &set["models"][0];
+        assert_eq!((&other["grade"], &other["average"]), (&expected["scores"][0], &expected["scores"][1]));
+        assert_ne!(other["average"], set["report"]["scores"][1]);
     }
     for file in ["figures/reliability", "figures/composition-errors", "tables/ranks", "tables/label-errors"] {
         let [first, second] =
@@ -264,9 +294,14 @@ fn sets_are_beside_each_other(output: &Path, found: &Value) {
         assert!((rho - set["report"]["scores"][0]["spearman"]["value"].as_f64().unwrap()).abs() < 1e-12);
     }
     // Two models and two sets.
-    let grid = std::fs::read_to_string(output.join("figures/error-grid.svg")).unwrap();
-    assert_eq!(grid.matches(": second.extxyz<").count(), 2, "{grid}");
+    let grids = ["error-grid", "error-grid-gamma"].map(|name| {
+        let grid = std::fs::read_to_string(output.join(format!("figures/{name}.svg"))).unwrap();
+        assert_eq!(grid.matches(": second.extxyz<").count(), 2, "{grid}");
+        std::fs::read_to_string(output.join(format!("figures/{name}.csv"))).unwrap()
+    });
+    assert!(grids[0] != grids[1]);
     let page = std::fs::read_to_string(output.join("validation.html")).unwrap();
+    assert!(page.contains("id=\"figure-error-grid\"") && page.contains("id=\"figure-error-grid-gamma\""));
     assert!(page.contains("second.extxyz</h2>") && page.contains("id=\"figure-reliability-2\""));
     assert_eq!(page.matches("<h2>Labelled structures of ").count(), 2);
     assert_eq!(page.matches("id=\"reliability-clip-1\"").count(), 1);
@@ -442,7 +477,10 @@ fn labelled_structures_have_a_section() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     baselines(here, &["b.npz", "--kind", "llpr"]);
-    write_frames(&here.join("labelled.extxyz"), &aluminium(3));
+    // One that cannot be graded is left out.
+    let mut frames = aluminium(4);
+    frames[1].structure.positions[1] = frames[1].structure.positions[0];
+    write_frames(&here.join("labelled.extxyz"), &frames);
     let printed =
         score(here, "labelled.extxyz", &["--baseline", "b.npz", "--json", "l.json", "--figures", "drawn"]);
     let quick = ["--scan-steps", "2", "--no-relax", "--collision-evaluations", "0"];
@@ -483,7 +521,9 @@ fn labelled_structures_have_a_section() {
     };
     write_frames(&here.join("bare.extxyz"), &[Frame::from(aluminium(1).remove(0).structure)]);
     assert!(refused("new", "bare.extxyz").contains("bare.extxyz: no structure has a label"));
-    assert!(refused("out", "out/structures.extxyz").contains("is a file of labelled structures"));
+    for file in ["out/structures.extxyz", "out/collisions.extxyz"] {
+        assert!(refused("out", file).contains("is a file of labelled structures"));
+    }
 }
 
 /// An artifact has the statistics of its data, from which the axes of the features follow; a mixture in a model's file has none.

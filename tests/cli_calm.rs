@@ -186,35 +186,36 @@ fn info_tells_model_and_artifact_apart() {
     assert!(text.contains("GRACE-1L") && text.contains("Si") && text.contains(" Å"), "{text}");
 }
 
+const CELL: &str = "1\nLattice=\"4 0 0 0 4 0 0 0 4\" Properties=species:S:1:pos:R:3\nAl 0 0 0\n";
+
 #[test]
-fn what_cannot_be_graded_is_named_with_its_line() {
+fn what_cannot_be_read_is_named_with_its_line() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let kokkos = config("data/al_eam_1l/kokkos.npz");
     let score = |input: &str| {
         refuse(here, ["calm", "score", "--model", kokkos.to_str().unwrap(), input, "--output", "out.extxyz"])
     };
-    let good = "1\nLattice=\"4 0 0 0 4 0 0 0 4\" Properties=species:S:1:pos:R:3\nAl 0 0 0\n";
     let write = |name: &str, text: String| std::fs::write(here.join(name), text).unwrap();
-    write("silicon.extxyz", good.to_owned() + &good.replace("Al", "Si"));
-    write("short.extxyz", good.to_owned() + "2\nProperties=species:S:1:pos:R:3\nAl 0 0 0\n");
-    write("number.extxyz", good.replace("Al 0", "Al x"));
+    write("short.extxyz", CELL.to_owned() + "2\nProperties=species:S:1:pos:R:3\nAl 0 0 0\n");
+    write("number.extxyz", CELL.replace("Al 0", "Al x"));
     write("empty.extxyz", String::new());
-    let two = good.replacen('1', "2", 1) + "Al 0 0 0\n";
-    write("coincident.extxyz", good.to_owned() + &two);
-    write("near.extxyz", good.to_owned() + &two.replace("Al 0 0 0\nAl 0 0 0", "Al 0 0 0\nAl 3.8 0 0"));
+    write("other.cif", CELL.to_owned());
+    let two = CELL.replacen('1', "2", 1);
+    write("coincident.extxyz", two.clone() + "Al 0 0 0\n");
+    write("near.extxyz", two + "Al 3.8 0 0\n");
     write("out.extxyz", "what was there".to_owned());
     for (file, place, reason) in [
-        ("silicon.extxyz", "silicon.extxyz:4:", "atom 0 is Si"),
         ("short.extxyz", "short.extxyz:7:", "ends after 1 of the 2 atoms"),
         ("number.extxyz", "number.extxyz:3:", "found 'x'"),
         ("empty.extxyz", "empty.extxyz", "no structures"),
+        ("other.cif", "other.cif", "extended XYZ"),
         (
             "coincident.extxyz",
-            "coincident.extxyz:4:",
+            "no structure can be graded; coincident.extxyz:1:",
             "atoms 0 and 1 are 0.000 Å apart; expected at least 0.4 Å",
         ),
-        ("near.extxyz", "near.extxyz:4:", "atoms 0 and 1 are 0.200 Å apart"),
+        ("near.extxyz", "near.extxyz:1:", "atoms 0 and 1 are 0.200 Å apart"),
         ("missing.extxyz", "missing.extxyz", "cannot be opened"),
     ] {
         let message = score(file);
@@ -223,6 +224,92 @@ fn what_cannot_be_graded_is_named_with_its_line() {
     assert_eq!(std::fs::read_to_string(here.join("out.extxyz")).unwrap(), "what was there");
     let left: Vec<_> = std::fs::read_dir(here).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     assert_eq!(left.len(), 7, "{left:?}");
+}
+
+#[test]
+fn structures_that_cannot_be_graded_are_left_out() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let kokkos = config("data/al_eam_1l/kokkos.npz").display().to_string();
+    let near = CELL.replacen('1', "2", 1) + "Al 3.8 0 0\n";
+    let all = [CELL, &CELL.replace("Al", "Si"), &near, CELL].concat();
+    std::fs::write(here.join("in.extxyz"), &all).unwrap();
+    let score = ["calm", "score", "--model", &kokkos, "in.extxyz", "--output"];
+    let more = ["out.extxyz", "--features", "z.npy", "--table", "t.csv"];
+    let output = calmwalk(here, score.iter().chain(&more));
+    let said = crate::common::stderr(&output);
+    assert_eq!(output.status.code(), Some(0), "{said}");
+    let line = "left out 2 structures that cannot be graded; the first: in.extxyz:4: atom 0 is Si";
+    assert!(said.contains(line), "{said}");
+    assert_eq!(String::from_utf8(output.stdout).unwrap(), "wrote 2 structures with grades to out.extxyz\n");
+    assert_eq!(read_extxyz(&here.join("out.extxyz")).unwrap().len(), 2);
+    let features = NpyFile::new(BufReader::new(File::open(here.join("z.npy")).unwrap())).unwrap();
+    assert_eq!(features.shape(), [2, 130]);
+    let rows = std::fs::read_to_string(here.join("t.csv")).unwrap();
+    let lines: Vec<_> = rows.lines().skip(1).map(|row| row.split(',').next().unwrap()).collect();
+    assert_eq!(lines, ["1", "11"]);
+    // They would be lost.
+    let message = refuse(here, score.iter().chain(&["in.extxyz"]));
+    assert!(message.contains("in.extxyz is the input, which has structures that were left out"), "{message}");
+    assert_eq!(std::fs::read_to_string(here.join("in.extxyz")).unwrap(), all);
+}
+
+#[test]
+fn packed_structures_are_graded_and_filtered() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let kokkos = config("data/al_eam_1l/kokkos.npz").display().to_string();
+    let two = CELL.replacen('1', "2", 1) + "Al 2.8 0 0\n";
+    let text = [CELL, &two].concat();
+    // A name without a known ending is read as extended XYZ.
+    std::fs::write(here.join("plain"), &text).unwrap();
+    std::fs::write(here.join("in.extxyz.zst"), zstd::encode_all(text.as_bytes(), 3).unwrap()).unwrap();
+    let score = |input: &str, output: &str, more: &[&str]| {
+        succeed(here, ["calm", "score", "--model", &kokkos, input, "--output", output].iter().chain(more));
+        std::fs::read(here.join(output)).unwrap()
+    };
+    let expected = score("plain", "a.extxyz", &[]);
+    assert!(score("in.extxyz.zst", "b.extxyz", &[]) == expected);
+    score("in.extxyz.zst", "c.extxyz", &["--where", "atoms = 2"]);
+    let found = read_extxyz(&here.join("c.extxyz")).unwrap();
+    assert!(found.len() == 1 && found[0].structure.len() == 2);
+    // The output is not packed.
+    let message =
+        refuse(here, ["calm", "score", "--model", &kokkos, "in.extxyz.zst", "--output", "in.extxyz.zst"]);
+    assert!(message.contains("in.extxyz.zst is the input"), "{message}");
+}
+
+#[test]
+fn outputs_replace_no_input() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    for file in ["kokkos.npz", "gmm_artifacts.npz"] {
+        std::fs::copy(config(&format!("data/al_eam_1l/{file}")), here.join(file)).unwrap();
+    }
+    std::fs::write(here.join("in.extxyz"), CELL).unwrap();
+    let names = ["in.extxyz", "kokkos.npz", "gmm_artifacts.npz"];
+    let contents = || names.map(|name| std::fs::read(here.join(name)).unwrap());
+    let before = contents();
+    let own = ["calm", "score", "--model", "kokkos.npz", "--artifact", "gmm_artifacts.npz", "in.extxyz"];
+    for (outputs, reason) in [
+        (&["--output", "gmm_artifacts.npz"][..], "gmm_artifacts.npz is the artifact"),
+        (&["--output", "kokkos.npz"], "kokkos.npz is the model"),
+        (&["--output", "o.extxyz", "--features", "kokkos.npz"], "kokkos.npz is the model"),
+        (&["--output", "o.extxyz", "--features", "in.extxyz"], "in.extxyz is the input"),
+        (&["--output", "o.extxyz", "--table", "in.extxyz"], "in.extxyz is the input"),
+        (&["--output", "o.extxyz", "--json", "gmm_artifacts.npz"], "gmm_artifacts.npz is the artifact"),
+        (
+            &["--output", "o.extxyz", "--ensemble", "e.npz", "--json", "e.npz"],
+            "e.npz is a model of the ensemble",
+        ),
+        (&["--output", "o.extxyz", "--baseline", "e.npz", "--json", "e.npz"], "e.npz is a file of baselines"),
+        (&["--output", "o.extxyz", "--table", "o.extxyz"], "one file is named for two outputs"),
+    ] {
+        std::fs::copy(here.join("kokkos.npz"), here.join("e.npz")).unwrap();
+        let message = refuse(here, own.iter().chain(outputs));
+        assert!(message.contains(reason), "{message}");
+    }
+    assert!(contents() == before && !here.join("o.extxyz").exists());
 }
 
 #[test]

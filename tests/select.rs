@@ -8,7 +8,7 @@ use atoms::read_extxyz;
 use serde_json::Value as Json;
 
 use crate::common::campaign::Small;
-use crate::common::{config, random, refuse, succeed, write_frames};
+use crate::common::{calmwalk, config, random, refuse, stderr, succeed, write_frames};
 
 fn file(path: &str) -> String {
     config(&format!("data/al_eam_1l/{path}")).display().to_string()
@@ -121,6 +121,53 @@ fn several_strategies_pick_from_what_is_left() {
     // Atoms above the window are ignored.
     let within = select(here, &["pool.extxyz", "--max-gamma", "1.5", "--min-gamma", "1.1", "-n", "1"]);
     assert!(within["picks"][0]["gamma_max"].as_f64() < Some(1.51));
+}
+
+#[test]
+fn structures_that_cannot_be_graded_are_left_out() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let frames = pool(&here.join("pool.extxyz"), 8);
+    let expected = select(here, &["pool.extxyz"]);
+    let (mut foreign, mut near) = (frames[0].clone(), frames[1].clone());
+    foreign.structure.species[0] = "Cu".parse().unwrap();
+    near.structure.positions[1] = near.structure.positions[0];
+    near.structure.positions[1][0] += 0.39;
+    let mut broken = frames;
+    broken.insert(0, foreign.clone());
+    broken.insert(3, near.clone());
+    write_frames(&here.join("broken.extxyz"), &broken);
+    let (model, artifact) = (file("kokkos.npz"), file("gmm_artifacts.npz"));
+    let own = ["select", "--model", &model, "--artifact", &artifact, "--output", "out.extxyz", "--json"];
+    let output = calmwalk(here, own.iter().chain(&["broken.extxyz"]));
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(0), "{said}");
+    let line = "left out 2 structures that cannot be graded; the first: broken.extxyz:1: atom 0 is Cu";
+    assert!(said.contains(line), "{said}");
+    let found: Json = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!((&found["pool"]["ungraded"], &found["pool"]["structures"]), (&2.into(), &8.into()));
+    assert_eq!(found["gamma_left"], expected["gamma_left"]);
+    // The same picks, each with its place in the file.
+    let selected = read_extxyz(&here.join("out.extxyz")).unwrap();
+    let picks = expected["picks"].as_array().unwrap();
+    assert!(picks.len() > 1 && selected.len() == picks.len());
+    for (frame, pick) in selected.iter().zip(picks) {
+        let (n, place) = (number(frame, "n"), number(frame, "source_frame") as usize);
+        assert_eq!(Some(n as u64), pick["source_frame"].as_u64());
+        assert_eq!(frame.structure, broken[place].structure);
+    }
+
+    write_frames(&here.join("near.extxyz"), &[near]);
+    let message = refused(here, &["near.extxyz", "--output", "x.extxyz"]);
+    assert!(
+        message.contains("no structure can be graded; near.extxyz:1: atoms 0 and 1 are 0.390 Å"),
+        "{message}"
+    );
+    // A file that cannot be read is an error.
+    let text = fs::read_to_string(here.join("pool.extxyz")).unwrap() + "2\n\nAl 0 0 0\n";
+    fs::write(here.join("pool.extxyz"), text).unwrap();
+    assert!(refused(here, &["pool.extxyz", "--output", "x.extxyz"]).contains("ends after 1 of the 2 atoms"));
+    assert!(!here.join("x.extxyz").exists());
 }
 
 #[test]

@@ -72,7 +72,7 @@ SCRIPT
 # Passes that are merged already are not submitted again.
 first=1
 [ ! -e "$output.build/partition" ] || first=2
-[ ! -e "$output.build/pass-2" ] || first=3
+[ ! -e "$output.build/end-2" ] || first=3
 after=()
 for ((pass = first; pass <= 3; pass++)); do
     array=$(submit "calm-pass-$pass" "${after[@]}" --array="1-$parts" -- calm build "$(printf '%q ' "${build[@]}")" \

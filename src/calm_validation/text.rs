@@ -96,11 +96,11 @@ fn sections<'a>(
         ),
     ];
     if sets.len() > 1 {
-        let blocks = [table("labelled-sets"), figure("error-grid")];
+        let blocks = [table("labelled-sets"), figure("error-grid"), figure("error-grid-gamma")];
         sections.push(("Sets of labelled structures", blocks.into_iter().flatten().collect()));
     } else {
-        let blocks = figure("error-grid").into_iter().collect();
-        sections.push(("Models on the labelled structures", blocks));
+        let blocks = [figure("error-grid"), figure("error-grid-gamma")];
+        sections.push(("Models on the labelled structures", blocks.into_iter().flatten().collect()));
     }
     let sections = sections.into_iter().map(|(heading, blocks)| (heading.to_owned(), blocks));
     let of_sets = sets.iter().enumerate().map(|(number, set)| {

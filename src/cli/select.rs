@@ -39,7 +39,8 @@ use crate::structure_files::StructureReadingArgs;
 ///
 /// Copies each picked frame and adds selection_strategy, selection_rank (from 1) and gamma_max (at the pick). Frames of files also get
 /// source_file and source_frame (from 0), candidates of campaigns also campaign, candidate_id and fate. `calmwalk import --queue`
-/// queues them in a campaign for labelling. See docs/select.md.
+/// queues them in a campaign for labelling. Leaves out structures that cannot be graded (an element that the model does not have, atoms
+/// closer than 0.4 Å), with a warning. See docs/select.md.
 #[derive(Debug, clap::Args)]
 pub struct SelectArgs {
     /// GRACE model (kokkos.npz)
@@ -410,6 +411,7 @@ impl SelectionReport<'_> {
                 "features_computed": self.pool.evaluated,
                 "features_from_stores": pool.len() as u64 - self.pool.evaluated,
                 "candidates_left_out": self.left_out(),
+                "ungraded": self.pool.left_out.count(),
             },
             "strategies": strategies.collect::<Vec<_>>(),
             "elements": elements.collect::<Vec<_>>(),

@@ -61,20 +61,9 @@ impl KnownShards {
     fn read_log(&mut self, mut log: ClusterLog) -> Result<(), CommandError> {
         let cannot = |error| unreadable(&log.path, error);
         let length = log.file.metadata().map_err(cannot)?.len();
-        let mut file = BufReader::new(&log.file);
-        let (mut header, mut content) = ([0; HEADER], Vec::new());
-        while length - log.end >= HEADER as u64 {
-            file.read_exact(&mut header).map_err(cannot)?;
-            let (size, index, shard, checksum) = fields(&header);
-            if size > length - log.end - HEADER as u64 {
-                break;
-            }
-            content.resize(size as usize, 0);
-            file.read_exact(&mut content).map_err(cannot)?;
-            if blake3::hash(&content) != checksum {
-                break;
-            }
-            self.places.insert((index, shard), (self.logs.len(), log.end));
+        let (mut file, mut content) = (BufReader::new(&log.file), Vec::new());
+        while let Some(shard) = next_record(&mut file, length, &mut content).map_err(cannot)? {
+            self.places.insert(shard, (self.logs.len(), log.end));
             log.end += (HEADER + content.len()) as u64;
         }
         self.logs.push(log);
@@ -151,6 +140,26 @@ impl KnownShards {
     }
 }
 
+/// Index and hash of the shard of the next record, with its content; `None` at the end of the log and for a record that is incomplete, also
+/// because another process cuts it off its log meanwhile. No content is longer than the log was.
+fn next_record(
+    log: &mut impl Read,
+    length: u64,
+    content: &mut Vec<u8>,
+) -> io::Result<Option<(u64, ShardHash)>> {
+    content.clear();
+    log.by_ref().take(HEADER as u64).read_to_end(content)?;
+    let Ok(header) = content.as_slice().try_into() else { return Ok(None) };
+    let (size, index, shard, checksum) = fields(header);
+    if size > length {
+        return Ok(None);
+    }
+    content.clear();
+    log.by_ref().take(size).read_to_end(content)?;
+    let is_complete = content.len() as u64 == size && blake3::hash(content) == checksum;
+    Ok(is_complete.then_some((index, shard)))
+}
+
 fn fields(header: &[u8; HEADER]) -> (u64, u64, ShardHash, blake3::Hash) {
     let number = |at: usize| u64::from_le_bytes(std::array::from_fn(|byte| header[at + byte]));
     let hash = |at: usize| -> [u8; 32] { std::array::from_fn(|byte| header[at + byte]) };
@@ -203,5 +212,21 @@ mod tests {
         assert_eq!(both.shards().count(), 3);
         assert_eq!(both.read(4, [4; 32]).unwrap(), Some(clusters(4)));
         assert_eq!(fs::read(&other).unwrap().len(), record + 5);
+    }
+
+    #[test]
+    fn a_record_that_another_process_cuts_off_meanwhile_is_none() {
+        let directory = tempfile::tempdir().unwrap();
+        let own = directory.path().join("own");
+        KnownShards::open(own.clone(), &[]).unwrap().append(4, [4; 32], &clusters(4)).unwrap();
+        let record = fs::read(&own).unwrap();
+        let mut content = Vec::new();
+        let mut found = |mut left: &[u8]| next_record(&mut left, record.len() as u64, &mut content).unwrap();
+        assert_eq!(found(&record), Some((4, [4; 32])));
+        // The log had the whole record when its length was read.
+        assert!((0..record.len()).all(|end| found(&record[..end]).is_none()));
+        let mut long = record.clone();
+        long[..8].copy_from_slice(&u64::MAX.to_le_bytes());
+        assert_eq!(found(&long), None);
     }
 }

@@ -9,15 +9,19 @@ use std::io::{self, BufReader, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
+use super::part::BuildPart;
 use super::stream::{Shard, ShardHash};
 
 /// Start of the names of the files.
 const NAME: &str = "features-";
 
+/// End of the names of those that are being written, which begin with a dot.
+const UNFINISHED: &str = ".part";
+
 /// Bytes of the checksum.
 const CHECKSUM: u64 = blake3::OUT_LEN as u64;
 
-/// The files, up to a total size.
+/// The files of a part's shards, up to a total size.
 pub struct FeatureCache {
     directory: PathBuf,
     /// D
@@ -33,13 +37,19 @@ pub struct FeatureCache {
 }
 
 impl FeatureCache {
-    /// Opens the files of a build in its directory; `limit` is the largest total size in bytes. Removes those beyond it.
-    pub fn open(directory: &Path, identity: Vec<u8>, dimension: usize, limit: u64) -> Self {
+    /// Opens the files of the shards of a part in the directory of its build; `limit` is their largest total size in bytes. Removes
+    /// those beyond it, and what a killed process left unfinished. Files of other parts are theirs.
+    pub fn open(directory: &Path, part: BuildPart, identity: Vec<u8>, dimension: usize, limit: u64) -> Self {
         let files = fs::read_dir(directory).into_iter().flatten().flatten();
         let mut used = 0;
-        for file in files.filter(|file| is_feature_file(&file.file_name().to_string_lossy())) {
+        for file in files {
+            let name = file.file_name();
+            let Some((shard, is_finished)) = shard_of(&name.to_string_lossy()) else { continue };
+            if !part.has(shard) {
+                continue;
+            }
             let size = file.metadata().map_or(0, |found| found.len());
-            if used + size <= limit {
+            if is_finished && used + size <= limit {
                 used += size;
             } else {
                 let _ = fs::remove_file(file.path());
@@ -77,7 +87,7 @@ impl FeatureCache {
             return None;
         }
         // No two threads or parts have the same shard.
-        let unfinished = self.directory.join(format!(".{NAME}{}.part", shard.index));
+        let unfinished = self.directory.join(format!(".{NAME}{}{UNFINISHED}", shard.index));
         match File::create(&unfinished) {
             Ok(file) => {
                 let (file, hasher) = (BufWriter::new(file), self.hasher(&shard.hash));
@@ -116,6 +126,13 @@ impl FeatureCache {
 /// Whether a file of this name has features.
 pub fn is_feature_file(name: &str) -> bool {
     name.starts_with(NAME)
+}
+
+/// The shard of a file of this name, and whether the file is finished.
+fn shard_of(name: &str) -> Option<(u64, bool)> {
+    let unfinished = name.strip_prefix('.').and_then(|name| name.strip_suffix(UNFINISHED));
+    let shard = unfinished.unwrap_or(name).strip_prefix(NAME)?;
+    Some((shard.parse().ok()?, unfinished.is_none()))
 }
 
 /// Reads a file.

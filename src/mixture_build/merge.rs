@@ -62,9 +62,14 @@ impl PartsMerge {
             return Ok(Merged::Pass(1));
         };
         let of_pass_2 = self.state.merged_sums(2)?;
-        if of_pass_2.finished.len() != partition.hashes.len() {
+        let is_complete = of_pass_2.finished.len() == partition.hashes.len();
+        // A process that makes the whole build may have left the sums of some shards.
+        if !is_complete {
             let sums = self.sums(2, &partition)?;
             self.state.save_sums(2, &sums)?;
+        }
+        if !is_complete || !self.state.has_ended_pass_2() {
+            self.state.end_pass_2()?;
             return Ok(Merged::Pass(2));
         }
         let of_pass_3 = self.sums(3, &partition)?;

@@ -82,8 +82,8 @@ impl MixtureBuild {
             print_stderr(format_args!("continuing from {}", state.directory().display()));
         }
         let identity = serde_json::to_vec(&identity).map_err(CommandError::failed)?;
-        let cache =
-            FeatureCache::open(state.directory(), identity, settings.dimension, context.max_feature_bytes);
+        let (directory, limit) = (state.directory(), context.max_feature_bytes);
+        let cache = FeatureCache::open(directory, context.shards(), identity, settings.dimension, limit);
         Ok(Self { bytes: context.files.total_bytes()?, context, settings, state, cache })
     }
 

@@ -52,10 +52,11 @@ impl<'a> PassProgress<'a> {
 
     /// Shows where the pass is.
     pub fn show(&self) {
-        self.bar.set((self.share() * PARTS as f64) as u64, || self.text());
+        let text = || self.text(self.begun.elapsed().as_secs_f64());
+        self.bar.set((self.share() * PARTS as f64) as u64, text);
         if !self.bar.is_shown() && self.line.get().elapsed() > LINE_INTERVAL {
             self.line.set(Instant::now());
-            print_stderr(self.text());
+            print_stderr(text());
         }
     }
 
@@ -87,8 +88,9 @@ impl<'a> PassProgress<'a> {
         (done / all.max(1.0)).min(1.0)
     }
 
-    fn text(&self) -> String {
-        let (seconds, (computed, skipped)) = (self.begun.elapsed().as_secs_f64(), self.structures());
+    /// After this many seconds.
+    fn text(&self, seconds: f64) -> String {
+        let (computed, skipped) = self.structures();
         let (share, shards) =
             (self.share(), output::count(self.counters.shards.load(Ordering::Relaxed), "shard"));
         let mut text = format!("pass {} of 3: {shards} done", self.pass);
@@ -108,4 +110,41 @@ impl<'a> PassProgress<'a> {
 
 fn duration(seconds: f64) -> indicatif::HumanDuration {
     indicatif::HumanDuration(Duration::from_secs_f64(seconds.clamp(0.0, 1e10)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What is said after 10 s, in which 50 structures were computed; 50 others had been before.
+    fn text(pass: usize, part: Option<&str>, total: Option<u64>) -> String {
+        let counters = Counters::default();
+        counters.bytes.store(300, Ordering::Relaxed);
+        counters.computed.store(50, Ordering::Relaxed);
+        counters.skipped.store(50, Ordering::Relaxed);
+        counters.shards.store(4, Ordering::Relaxed);
+        let part = part.map(|part| part.parse().unwrap());
+        PassProgress::new(pass, part, total, 1200, &counters).text(10.0)
+    }
+
+    #[test]
+    fn rate_and_expected_end_follow_from_what_was_computed() {
+        // 300 of 400 structures are left: 60 s. A whole pass takes 80 s, and there are two more.
+        let begin = "pass 1 of 3: 4 shards done, 5.0 structures/s, ";
+        assert_eq!(
+            text(1, None, None),
+            format!("{begin}60 seconds left in this pass, at most 4 minutes in all")
+        );
+        // 500 of 600 structures are left, 100 s, and one more pass of 120 s.
+        let begin = "pass 2 of 3: 4 shards done, 5.0 structures/s, ";
+        let found = text(2, None, Some(600));
+        assert_eq!(found, format!("{begin}2 minutes left in this pass, at most 4 minutes in all"));
+        // A part ends with its pass, and knows its share of the files only.
+        assert_eq!(text(2, Some("1/3"), Some(600)), format!("{begin}60 seconds left in this pass"));
+        let begin = "pass 3 of 3: 4 shards done, 5.0 structures/s, ";
+        assert_eq!(text(3, None, Some(150)), format!("{begin}10 seconds left in this pass"));
+        // Nothing is known yet.
+        let counters = Counters::default();
+        assert_eq!(PassProgress::new(1, None, None, 0, &counters).text(0.0), "pass 1 of 3: 0 shards done");
+    }
 }

@@ -1,9 +1,9 @@
 //! The state of a build on disk, from which it continues after any interruption.
 //!
 //! The directory `A.npz.build` beside the artifact has `build.json`, which identifies the build; the log `pass-1` of the clusters
-//! of shards; `partition`, which ends pass 1; one file each for the running sums of passes 2 and 3; and those of the `feature_cache`. Each part of a build by
-//! several processes has its own files, with its name (`pass-2-3of8`), and an `end-1-3of8` when it is through pass 1. Every file but
-//! the log appears complete, by renaming; all carry checksums.
+//! of shards; `partition`, which ends pass 1; one file each for the running sums of passes 2 and 3; an empty `end-2` once `pass-2` has all shards;
+//! and those of the `feature_cache`. Each part of a build by several processes has its own files, with its name (`pass-2-3of8`), and an
+//! `end-1-3of8` when it is through pass 1. Every file but the log appears complete, by renaming; all that have contents carry checksums.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, TryLockError};
@@ -28,6 +28,8 @@ const LOCK: &str = "lock";
 const PARTITION: &str = "partition";
 const CLUSTERS: &str = "pass-1";
 const END: &str = "end-1-";
+/// `configs/slurm/calm-build.sh` looks for it.
+const END_OF_PASS_2: &str = "end-2";
 
 /// The state is saved again once this many times the duration of the last time has passed: it costs at most 5 % of the time.
 const PAUSE: u32 = 19;
@@ -121,7 +123,8 @@ impl BuildState {
         let found = state.identity()?;
         identity.check_same(&found).map_err(|difference| state.other_build(&difference))?;
         let names = state.names()?;
-        let exists = names.iter().any(|name| is_result(name) && name.contains(&part.file_name()));
+        let end = format!("-{}", part.file_name());
+        let exists = names.iter().any(|name| is_result(name) && name.ends_with(&end));
         Ok((state, exists))
     }
 
@@ -238,6 +241,16 @@ impl BuildState {
         Ok(self.read(&format!("pass-{pass}"))?.unwrap_or_default())
     }
 
+    /// Ends pass 2 of the whole, whose sums over all shards are saved.
+    pub fn end_pass_2(&self) -> Result<(), CommandError> {
+        AtomicFile::create(&self.path(END_OF_PASS_2))?.finish()
+    }
+
+    /// Whether pass 2 of the whole was ended.
+    pub fn has_ended_pass_2(&self) -> bool {
+        self.path(END_OF_PASS_2).exists()
+    }
+
     /// Replaces the sums of pass 2 or 3.
     pub fn save_sums(&mut self, pass: usize, sums: &RunningSums) -> Result<(), CommandError> {
         self.write(&self.own_name(&format!("pass-{pass}")), sums)
@@ -337,7 +350,7 @@ impl BuildState {
 }
 
 fn is_result(name: &str) -> bool {
-    name == PARTITION || name.starts_with("pass-") || name.starts_with(END)
+    name == PARTITION || name == END_OF_PASS_2 || name.starts_with("pass-") || name.starts_with(END)
 }
 
 /// Where the state of the build of `output` is.

@@ -24,6 +24,7 @@ impl MixtureBuild {
         partition: &Partition,
     ) -> Result<Option<Vec<Option<Vec<BuiltComponent>>>>, CommandError> {
         let Some(sums) = self.sums_of_pass_2(partition)? else { return Ok(None) };
+        self.state.end_pass_2()?;
         components_from_sums(self.settings.dimension, partition, sums).map(Some)
     }
 

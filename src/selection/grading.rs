@@ -16,7 +16,8 @@ use super::campaign::CampaignCandidates;
 use super::compositions::Compositions;
 use super::{GradedPool, ItemPlace, PoolItem, PoolStructure, StructureSource};
 use crate::exit_status::CommandError;
-use crate::features::FeatureCalculator;
+use crate::features::{FeatureCalculator, FeatureError};
+use crate::left_out::LeftOutStructures;
 use crate::output::{self, Bar};
 use crate::structure_files::{StructureFiles, StructureReader};
 
@@ -51,6 +52,13 @@ struct Worker {
     grades: Grades,
 }
 
+/// What was found of an item.
+enum GradedItem {
+    Graded(GradedStructure),
+    /// Why the structure cannot be graded.
+    Ungraded(String),
+}
+
 /// What was found of a structure.
 struct GradedStructure {
     elements: Vec<usize>,
@@ -61,7 +69,11 @@ struct GradedStructure {
 }
 
 impl PoolGrading {
-    /// Grades every structure of the files, then of the campaigns; `None` after a cancellation of `stop`.
+    /// Grades every structure of the files, then of the campaigns; `None` after a cancellation of `stop`. Warns of structures that
+    /// cannot be graded, and leaves them out.
+    ///
+    /// # Errors
+    /// A file that cannot be read, a model that does not answer, no structure that can be graded.
     pub fn run(&self, pool: &mut PoolFiles) -> Result<Option<GradedPool>, CommandError> {
         let bytes = Arc::new(AtomicU64::new(0));
         let total = pool.files.total_bytes()?;
@@ -85,10 +97,13 @@ impl PoolGrading {
             elements: self.model.elements().len(),
             compositions: Compositions::default(),
             evaluated: 0,
+            left_out: LeftOutStructures::default(),
         };
         loop {
             let block = reader.block(BLOCK * self.threads)?;
             if block.is_empty() {
+                drop(bar);
+                found.left_out.warn(found.structures.len() as u64)?;
                 return Ok(Some(found));
             }
             if self.stop.is_cancelled() {
@@ -96,7 +111,10 @@ impl PoolGrading {
             }
             let graded = self.grade(&mut workers, &block);
             for (item, graded) in block.iter().zip(graded) {
-                found.add(item, &graded?)?;
+                match graded? {
+                    GradedItem::Graded(graded) => found.add(item, &graded)?,
+                    GradedItem::Ungraded(reason) => found.left_out.add(&item.place, reason),
+                }
             }
             let count = found.structures.len();
             bar.set(bytes.load(Ordering::Relaxed), || output::count(count, "structure"));
@@ -104,11 +122,7 @@ impl PoolGrading {
     }
 
     /// In the order of the block.
-    fn grade(
-        &self,
-        workers: &mut [Worker],
-        block: &[PoolItem],
-    ) -> Vec<Result<GradedStructure, CommandError>> {
+    fn grade(&self, workers: &mut [Worker], block: &[PoolItem]) -> Vec<Result<GradedItem, CommandError>> {
         let items = Mutex::new(block.iter().enumerate());
         let next = || items.lock().unwrap_or_else(PoisonError::into_inner).next();
         let share = |worker: &mut Worker| {
@@ -136,24 +150,32 @@ impl PoolGrading {
 }
 
 impl Worker {
-    fn grade(&mut self, mixture: &Mixture, item: &PoolItem) -> Result<GradedStructure, CommandError> {
-        let wrong = |error: &dyn std::fmt::Display| CommandError::Input(format!("{}: {error}", item.place));
-        let size = item.structure.len() * mixture.dimension();
-        let (elements, features) = match &item.features {
+    fn grade(&mut self, mixture: &Mixture, item: &PoolItem) -> Result<GradedItem, CommandError> {
+        let (elements, features) = match self.features(item) {
+            Ok(found) => found,
+            Err(error) if error.is_of_structure() => return Ok(GradedItem::Ungraded(error.to_string())),
+            Err(error) => return Err(CommandError::Failed(format!("{}: {error}", item.place))),
+        };
+        if let Err(error) = self.grades.evaluate(mixture, &elements, &features, None) {
+            return Ok(GradedItem::Ungraded(error.to_string()));
+        }
+        let (slots, gamma) = (self.grades.component.clone(), self.grades.gamma.clone());
+        let evaluated = item.features.is_none();
+        Ok(GradedItem::Graded(GradedStructure { elements, slots, gamma, features, evaluated }))
+    }
+
+    /// Element indices and features of the atoms, `[n]` and `[n × D]`.
+    fn features(&mut self, item: &PoolItem) -> Result<(Vec<usize>, Vec<f64>), FeatureError> {
+        match &item.features {
             Some(features) => {
                 let model = self.calculator.potential.model();
-                let elements =
-                    model.element_indices(&item.structure.species).map_err(|error| wrong(&error))?;
-                (elements, features.clone())
+                Ok((model.element_indices(&item.structure.species)?, features.clone()))
             }
             None => {
-                let elements = self.calculator.compute(&item.structure).map_err(|error| wrong(&error))?;
-                (elements, self.calculator.potential.features()[..size].to_vec())
+                let elements = self.calculator.compute(&item.structure)?;
+                Ok((elements, self.calculator.features().to_vec()))
             }
-        };
-        self.grades.evaluate(mixture, &elements, &features, None).map_err(|error| wrong(&error))?;
-        let (slots, gamma) = (self.grades.component.clone(), self.grades.gamma.clone());
-        Ok(GradedStructure { elements, slots, gamma, features, evaluated: item.features.is_none() })
+        }
     }
 }
 

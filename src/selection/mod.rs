@@ -20,6 +20,7 @@ pub use self::output::frames;
 pub use self::picks::{Pick, Picks, Rules, pick};
 pub use self::stored_features::FeatureIdentity;
 pub use self::strategy::{Strategy, StrategyQuota};
+use crate::left_out::LeftOutStructures;
 
 /// Structures of a pool with the grades of their atoms.
 pub struct GradedPool {
@@ -31,6 +32,8 @@ pub struct GradedPool {
     compositions: Compositions,
     /// Structures whose features were computed; those of the others were in the store of their campaign.
     pub evaluated: u64,
+    /// Structures that cannot be graded, and are none of the above.
+    pub left_out: LeftOutStructures,
 }
 
 /// What is kept of every structure, 40 bytes.

@@ -47,39 +47,30 @@ fn read_files(
     picks: &[Pick],
     frames: &mut [Option<Frame>],
 ) -> Result<(), CommandError> {
-    // Structures of files are numbered first, in the order in which they are read.
-    let is_file =
-        |pick: &Pick| matches!(pool.structures[pick.structure].source, StructureSource::File { .. });
-    let mut wanted: Vec<(usize, usize)> = picks
-        .iter()
-        .enumerate()
-        .filter(|(_, pick)| is_file(pick))
-        .map(|(rank, pick)| (pick.structure, rank))
-        .collect();
+    let of_file = |(rank, pick): (usize, &Pick)| match pool.structures[pick.structure].source {
+        StructureSource::File { file, frame } => Some((file as usize, u64::from(frame), rank)),
+        StructureSource::Candidate { .. } => None,
+    };
+    let mut wanted: Vec<_> = picks.iter().enumerate().filter_map(of_file).collect();
     wanted.sort_unstable();
-    if wanted.is_empty() {
-        return Ok(());
-    }
     let mut reader = files.files.reader(Arc::new(AtomicU64::new(0)));
-    let mut number = 0;
-    for (structure, rank) in wanted {
-        let mut last = None;
-        while number <= structure {
-            let Some((frame, file)) = reader.next()? else { return Ok(()) };
-            number += 1;
-            last = Some((frame, file));
-        }
-        let Some((mut frame, file)) = last else { continue };
-        if hash(&frame.structure) != pool.structures[structure].hash {
+    for (in_file, in_frame, rank) in wanted {
+        let (mut frame, file) = loop {
+            let Some(found) = reader.next()? else { return Ok(()) };
+            if (reader.file_index(), reader.frame_index()) >= (in_file, in_frame) {
+                break found;
+            }
+        };
+        let is_same = (reader.file_index(), reader.frame_index()) == (in_file, in_frame);
+        if !is_same || hash(&frame.structure) != pool.structures[picks[rank].structure].hash {
             return Err(CommandError::Failed(format!(
                 "{}:{}: the file was changed during the selection; repeat the command",
                 file.path.display(),
                 frame.line
             )));
         }
-        let index = i64::try_from(reader.frame_index()).unwrap_or(i64::MAX);
         frame.info.insert("source_file".to_owned(), file.path.display().to_string().into());
-        frame.info.insert("source_frame".to_owned(), index.into());
+        frame.info.insert("source_frame".to_owned(), i64::try_from(in_frame).unwrap_or(i64::MAX).into());
         frames[rank] = Some(frame);
     }
     Ok(())

@@ -1,11 +1,11 @@
 //! The arguments of a command that reads structures from files.
 
 use std::collections::HashSet;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use atoms::Species;
 
-use super::format::check_format;
+use super::format::{check_format, check_format_or_extxyz};
 use super::{StructureFile, StructureFiles};
 use crate::exit_status::CommandError;
 use crate::filter::StructureFilter;
@@ -47,12 +47,18 @@ impl StructureArgs {
 }
 
 impl StructureReadingArgs {
-    /// These files in the order given, all with weight 1.
+    /// A single file, which is read once: it may be a pipe. If its name shows no format, it is read as extended XYZ.
     ///
     /// # Errors
-    /// A file that is no regular file, has an unknown format or is given twice; a filter by a property that structures of files do
-    /// not have.
-    pub fn files(&self, data: &[PathBuf]) -> Result<StructureFiles, CommandError> {
+    /// A file of a format that cannot be read; a filter as in [`Self::files`].
+    pub fn single_file(&self, path: &Path) -> Result<StructureFiles, CommandError> {
+        self.check_filter()?;
+        check_format_or_extxyz(path)?;
+        let files = vec![StructureFile { path: path.into(), weight: 1.0 }];
+        Ok(StructureFiles { files, filter: self.filter.clone(), dump_elements: self.dump_elements.clone() })
+    }
+
+    fn check_filter(&self) -> Result<(), CommandError> {
         if let Some(filter) = &self.filter
             && let Some(name) = filter.names().into_iter().find(|name| !PROPERTIES.contains(name))
         {
@@ -61,6 +67,16 @@ impl StructureReadingArgs {
                 PROPERTIES.join(", ")
             )));
         }
+        Ok(())
+    }
+
+    /// These files in the order given, all with weight 1.
+    ///
+    /// # Errors
+    /// A file that is no regular file, has an unknown format or is given twice; a filter by a property that structures of files do
+    /// not have.
+    pub fn files(&self, data: &[PathBuf]) -> Result<StructureFiles, CommandError> {
+        self.check_filter()?;
         let (mut files, mut known) = (Vec::with_capacity(data.len()), HashSet::new());
         for path in data {
             check_format(path)?;

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use atoms::extxyz::{self, Frame};
-use atoms::{FileError, Species, lammps_dump, poscar};
+use atoms::{FileError, Species, lammps_dump, open_extxyz, poscar};
 use flate2::read::MultiGzDecoder;
 
 use crate::exit_status::CommandError;
@@ -43,6 +43,22 @@ fn format(path: &Path) -> Option<StructureFormat> {
     }
 }
 
+/// Checks that a file can be opened. If its name shows no format, or it is a pipe, it is read as extended XYZ.
+pub fn check_format_or_extxyz(path: &Path) -> Result<(), CommandError> {
+    let is_known = match std::fs::metadata(path) {
+        Ok(found) => !found.is_dir() && (!found.is_file() || format(path).is_some()),
+        Err(_) => false,
+    };
+    if is_known { Ok(()) } else { open_extxyz(path).map(drop).map_err(CommandError::input) }
+}
+
+/// Whether a file of this name is read as extended XYZ that is not packed.
+pub fn is_plain_extxyz(path: &Path) -> bool {
+    let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+    let is_packed = name.ends_with(".gz") || name.ends_with(".zst");
+    !is_packed && matches!(format(path), None | Some(StructureFormat::Extxyz))
+}
+
 /// Checks that the name of a file shows a format that can be read.
 pub fn check_format(path: &Path) -> Result<(), CommandError> {
     if format(path).is_some() {
@@ -56,18 +72,17 @@ pub fn check_format(path: &Path) -> Result<(), CommandError> {
 }
 
 impl Structures {
-    /// Opens a file; `bytes` counts what is read of it.
+    /// Opens a file, as extended XYZ if its name shows no format; `bytes` counts what is read of it.
     pub fn open(path: &Path, dump_elements: &[Species], bytes: &Arc<AtomicU64>) -> Result<Self, FileError> {
         let input =
             unpacked(path, bytes).map_err(|source| FileError::Open { path: path.to_path_buf(), source })?;
-        match format(path) {
-            Some(StructureFormat::Extxyz) => Ok(Self::Extxyz(Box::new(extxyz::ExtxyzReader::new(input)))),
-            Some(StructureFormat::Poscar) => Ok(Self::Poscar(Some(input))),
-            Some(StructureFormat::LammpsDump) => Ok(Self::LammpsDump(Box::new(
-                lammps_dump::LammpsDumpReader::new(input, dump_elements.to_vec()),
-            ))),
-            None => Err(FileError::Format(path.to_path_buf())),
-        }
+        Ok(match format(path).unwrap_or(StructureFormat::Extxyz) {
+            StructureFormat::Extxyz => Self::Extxyz(Box::new(extxyz::ExtxyzReader::new(input))),
+            StructureFormat::Poscar => Self::Poscar(Some(input)),
+            StructureFormat::LammpsDump => {
+                Self::LammpsDump(Box::new(lammps_dump::LammpsDumpReader::new(input, dump_elements.to_vec())))
+            }
+        })
     }
 
     /// The next structure. Errors name `path`, that of the file.

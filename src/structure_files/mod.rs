@@ -13,6 +13,7 @@ use atoms::Species;
 use atoms::extxyz::Frame;
 
 pub use self::arguments::{StructureArgs, StructureReadingArgs};
+pub use self::format::is_plain_extxyz;
 pub use self::reader::{FileLine, StructureReader};
 use crate::exit_status::CommandError;
 use crate::filter::StructureFilter;

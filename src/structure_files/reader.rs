@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 
 use atoms::FileError;
-use atoms::extxyz::Frame;
+use atoms::extxyz::{Frame, LabelError};
 
 use super::format::Structures;
 use super::{StructureFile, StructureFiles};
@@ -128,13 +128,20 @@ fn matches(
     file: &StructureFile,
 ) -> Result<bool, CommandError> {
     let Some(filter) = filter else { return Ok(true) };
-    let labels =
-        frame.labels().map_err(|error| CommandError::Input(format!("{}: {error}", file.path.display())))?;
+    let wrong = |error: LabelError| CommandError::Input(format!("{}: {error}", file.path.display()));
+    let names = filter.names();
+    // Wrong labels that the filter does not name are none of its business.
+    let energy = if names.iter().any(|name| ["energy", "energy_per_atom"].contains(name)) {
+        frame.energy_label().map_err(wrong)?
+    } else {
+        None
+    };
+    let forces = if names.contains(&"max_force") { frame.force_labels().map_err(wrong)? } else { None };
     let norm = |force: &[f64; 3]| force.iter().map(|x| x * x).sum::<f64>().sqrt();
     let properties = StructureProperties {
         species: &frame.structure.species,
-        energy: labels.energy,
-        max_force: labels.forces.map(|forces| forces.iter().map(norm).fold(0.0, f64::max)),
+        energy,
+        max_force: forces.map(|forces| forces.iter().map(norm).fold(0.0, f64::max)),
         ..StructureProperties::default()
     };
     Ok(filter.matches(&properties))
@@ -158,6 +165,36 @@ mod tests {
         let error = reader.next().unwrap_err();
         assert!(error.to_string().contains("broken.dump:2: "), "{error}");
         assert!(reader.next().unwrap().is_none());
+    }
+
+    #[test]
+    fn a_filter_reads_only_the_labels_that_it_names() {
+        let directory = tempfile::tempdir().unwrap();
+        let path: Arc<Path> = directory.path().join("clusters.xyz").into();
+        let virial = "virial=\"1 0 0 0 1 0 0 0 1\"";
+        let frames = [
+            format!("energy=1 {virial} pbc=\"F F F\""),
+            "REF_energy=2 REF_stress=much".to_owned(),
+            "energy=much".to_owned(),
+        ];
+        let frames = frames.map(|comment| format!("1\n{comment}\nAl 0 0 0\n"));
+        let count = |frames: &[String], filter: &str| {
+            fs::write(&path, frames.concat()).unwrap();
+            let filter = Some(filter.parse().unwrap());
+            let files = vec![StructureFile { path: path.clone(), weight: 1.0 }];
+            let mut reader =
+                StructureFiles { files, filter, dump_elements: Vec::new() }.reader(Arc::default());
+            let mut count = 0;
+            while reader.next().map_err(|error| error.to_string())?.is_some() {
+                count += 1;
+            }
+            Ok::<u32, String>(count)
+        };
+        assert_eq!(count(&frames, "atoms < 200 and element = Al"), Ok(3));
+        assert_eq!(count(&frames[..2], "energy < 3"), Ok(2));
+        assert_eq!(count(&frames[..2], "energy_per_atom < 1.5"), Ok(1));
+        let error = count(&frames, "energy < 3").unwrap_err();
+        assert!(error.contains("clusters.xyz") && error.contains("energy is 'much'"), "{error}");
     }
 
     #[test]

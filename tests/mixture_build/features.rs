@@ -54,3 +54,37 @@ fn stored_features_change_no_byte_also_if_they_are_damaged() {
     let refused = refuse(here, arguments("x.npz", &["data.extxyz"], &["--max-feature-cache", "lots"]));
     assert!(refused.contains("expected 0 to 1e6 GB"), "{refused}");
 }
+
+#[test]
+fn each_part_has_a_limit_of_its_own() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    // Four shards, two of each part, of which each has 337 kB of features.
+    write_frames(&here.join("data.extxyz"), &frames()[..12]);
+    let state = here.join("out.npz.build");
+    let part = |pass: &str, part: &str, gigabytes: &str| {
+        let more = ["--pass", pass, "--part", part, "--max-feature-cache", gigabytes];
+        succeed(here, arguments("out.npz", &["data.extxyz"], &more));
+        files(&state)
+    };
+    let model = config(MODEL).display().to_string();
+    let merge = || succeed(here, ["calm", "merge", "--model", &model, "--output", "out.npz"]);
+    let all = ["features-0", "features-1", "features-2", "features-3"];
+    assert_eq!(part("1", "1/2", "0.0007"), ["features-0", "features-2"]);
+    // What another part has stored does not count.
+    assert_eq!(part("1", "2/2", "0.0007"), all);
+    merge();
+    // As processes leave them that are killed while they write.
+    for shard in [0, 1] {
+        fs::write(state.join(format!(".features-{shard}.part")), [0; 1000]).unwrap();
+    }
+    // Each part removes its own.
+    assert_eq!(part("2", "1/2", "0.0007"), [&[".features-1.part"], &all[..]].concat());
+    assert_eq!(part("2", "2/2", "0.0007"), all);
+    merge();
+    let left = part("3", "1/2", "0.0004");
+    assert!(
+        left.len() == 3 && left.contains(&all[1].to_owned()) && left.contains(&all[3].to_owned()),
+        "{left:?}"
+    );
+}

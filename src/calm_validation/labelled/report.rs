@@ -227,6 +227,11 @@ pub struct TrainingErrors {
 }
 
 impl LabelledReport {
+    /// γ, the first of the scores.
+    pub fn grade(&self) -> Option<&ScoreReport> {
+        self.scores.first()
+    }
+
     /// γ_nbr, the second of the scores: γ and γ_nbr come before all others.
     pub fn average(&self) -> Option<&ScoreReport> {
         self.scores.get(1)

@@ -22,13 +22,23 @@ pub struct LabelledSet {
     pub models: Vec<ComparedModel>,
 }
 
-/// What γ_nbr of another model says about that model's errors.
+/// What the grades of another model say about that model's errors.
 #[derive(Clone, Debug, Serialize)]
 pub struct ComparedModel {
     /// Its file.
     pub model: String,
+    /// γ.
+    pub grade: ScoreReport,
     /// γ_nbr.
     pub average: ScoreReport,
+}
+
+impl ComparedModel {
+    /// With the report of the structures under this model; `None` without its scores.
+    pub fn new(model: String, report: &LabelledReport) -> Option<Self> {
+        let (grade, average) = (report.grade()?.clone(), report.average()?.clone());
+        Some(Self { model, grade, average })
+    }
 }
 
 /// A table with every score of every set, the sets below each other; without rows for a single set.

@@ -10,7 +10,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::campaign_updates::UpdateSource;
 use crate::artifact_checks::check_sound;
-use crate::atomic_file::{AtomicFile, refuse_to_replace};
+use crate::atomic_file::check_outputs;
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::{FeatureModel, FeatureVariant};
 use crate::loaded_model::LoadedModel;
@@ -124,9 +124,7 @@ impl CalmBuildArgs {
         files.set_weights(&self.weight)?;
         let data = files.paths().map(|path| (path, "a file of training data"));
         let inputs: Vec<_> = std::iter::once((self.model.as_path(), "the model")).chain(data).collect();
-        let outputs = || std::iter::once(&self.output).chain(&self.embed);
-        outputs().try_for_each(|output| refuse_to_replace(output, inputs.iter().copied()))?;
-        outputs().try_for_each(|output| AtomicFile::create(output).map(drop))?;
+        check_outputs(std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path), &inputs)?;
         Ok(files)
     }
 

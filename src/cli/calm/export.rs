@@ -9,7 +9,7 @@ use serde_json::Value;
 use store::Store;
 use tempfile::TempDir;
 
-use crate::atomic_file::refuse_to_replace;
+use crate::atomic_file::check_outputs;
 use crate::cli::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::mixture_files::MixtureFiles;
 use crate::output::{count, print};
@@ -120,12 +120,10 @@ impl CalmExportArgs {
     }
 
     fn check_outputs(&self, artifact: &Path, model: Option<&Path>) -> Result<(), CommandError> {
-        let inputs = || {
-            let model = model.map(|path| (path, "the model of the campaign"));
-            std::iter::once((artifact, "the artifact of the campaign")).chain(model)
-        };
-        let mut outputs = std::iter::once(&self.output).chain(&self.embed);
-        outputs.try_for_each(|output| refuse_to_replace(output, inputs()))
+        let model = model.map(|path| (path, "the model of the campaign"));
+        let inputs: Vec<_> =
+            std::iter::once((artifact, "the artifact of the campaign")).chain(model).collect();
+        check_outputs(std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path), &inputs)
     }
 
     fn report(&self, found: &Version) -> Result<(), CommandError> {

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use analysis::GradedRow;
 use figures::{to_png, to_svg};
 
-use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
+use crate::atomic_file::{AtomicFile, cannot_write, check_outputs, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::output::{count, print, print_json};
 use crate::page::{create_directory, write_files};
@@ -90,9 +90,8 @@ fn finite(text: &str) -> Result<f64, String> {
 impl CalmFilterArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         let is_png = self.figure.as_deref().map(is_png).transpose()?;
-        for output in self.csv.iter().chain(&self.figure) {
-            refuse_to_replace(output, [(self.table.as_path(), "the table")])?;
-        }
+        let outputs = self.csv.iter().chain(&self.figure).map(PathBuf::as_path);
+        check_outputs(outputs, &[(&self.table, "the table")])?;
         let (rows, left_out) = reliability_filter::read(&self.table, &self.columns(), self.skip_missing)?;
         let report = FilterReport::new(&rows, left_out, &self.thresholds, self.draws, self.rng_seed);
         if let Some(path) = &self.csv {

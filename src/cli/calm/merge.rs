@@ -6,7 +6,7 @@ use calm::build::BuildSettings;
 
 use super::build::{report, stopped, write_mixture};
 use super::campaign_updates::UpdateSource;
-use crate::atomic_file::{AtomicFile, refuse_to_replace};
+use crate::atomic_file::check_outputs;
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureVariant;
 use crate::loaded_model::LoadedModel;
@@ -40,10 +40,8 @@ pub struct CalmMergeArgs {
 
 impl CalmMergeArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
-        for output in std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path) {
-            refuse_to_replace(output, [(self.model.as_path(), "the model")])?;
-            AtomicFile::create(output)?;
-        }
+        let outputs = std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path);
+        check_outputs(outputs, &[(&self.model, "the model")])?;
         let campaign = self.campaign.as_deref().map(UpdateSource::find).transpose()?;
         let model = LoadedModel::load(&self.model)?;
         let hash = model.identity(&self.model)?;

@@ -54,6 +54,13 @@ pub enum OtherScoreError {
     Ensemble(#[from] EnsembleError),
 }
 
+impl OtherScoreError {
+    /// Whether other structures may be scored.
+    pub fn is_of_structure(&self) -> bool {
+        matches!(self, Self::Features(error) if error.is_of_structure())
+    }
+}
+
 impl OtherScores {
     /// No other score.
     pub fn none() -> Self {

@@ -6,7 +6,7 @@ use calm::Artifact;
 use calm::build::{ElementHistograms, Recalibration, ThresholdRule, read_histograms};
 
 use crate::artifact_checks::check_sound;
-use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
+use crate::atomic_file::{AtomicFile, cannot_write, check_outputs};
 use crate::cli::{CommandError, ExitStatus};
 use crate::mixture_files::open;
 use crate::output::{TextTable, print};
@@ -37,12 +37,10 @@ pub struct CalmRecalibrateArgs {
 
 impl CalmRecalibrateArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
-        let outputs = || std::iter::once(&self.output).chain(&self.embed);
-        let inputs = || {
-            let model = self.model.iter().map(|path| (path.as_path(), "the model"));
-            std::iter::once((self.artifact.as_path(), "the artifact itself")).chain(model)
-        };
-        outputs().try_for_each(|output| refuse_to_replace(output, inputs()))?;
+        let model = self.model.iter().map(|path| (path.as_path(), "the model"));
+        let inputs: Vec<_> =
+            std::iter::once((self.artifact.as_path(), "the artifact itself")).chain(model).collect();
+        check_outputs(std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path), &inputs)?;
         let before = Artifact::load(&self.artifact).map_err(CommandError::input)?;
         check_sound(&before, &self.artifact).map_err(CommandError::Input)?;
         if let Some(model) = &self.model {

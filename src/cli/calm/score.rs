@@ -3,8 +3,8 @@
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
-use atoms::FileError;
 use atoms::extxyz::{Column, ColumnData, ExtxyzValue, Frame, write_frame};
 use calm::{Artifact, NeighbourWeights};
 use npyz::{NpyWriter, WriterBuilder};
@@ -14,12 +14,13 @@ use super::score_calibration::{self, ScoreCalibration};
 use super::score_labels::ScoreLabels;
 use super::scorer::Scorer;
 use crate::artifact_checks::check_sound;
-use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
+use crate::atomic_file::{AtomicFile, cannot_write, check_outputs, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureModel;
+use crate::left_out::LeftOutStructures;
 use crate::loaded_model::LoadedModel;
 use crate::output::{self, Bar, print};
-use crate::xyz_reader::XyzReader;
+use crate::structure_files::{FileLine, StructureReadingArgs, is_plain_extxyz};
 
 /// Keys of labels in a frame.
 const LABELS: [&str; 5] = ["energy", "free_energy", "forces", "stress", "virial"];
@@ -30,9 +31,9 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 ///
 /// Writes every frame with the model's energy (eV), forces (eV/Å) and, for periodic cells, stress (eV/Å³, tension positive),
 /// and per atom gamma (extrapolation grade γ), gamma_nbr (its neighbourhood average), sigma (Mahalanobis distance σ) and
-/// component (nearest component of the atom's element, from 0). Refuses structures with atoms closer than 0.4 Å, and mixtures
-/// that cannot come from training data. With an artifact of other features of the model (`calm build --feature-variant`), grades those
-/// features.
+/// component (nearest component of the atom's element, from 0). Leaves out structures that cannot be graded (atoms closer than 0.4 Å,
+/// an element that the model does not have), with a warning. Refuses mixtures that cannot come from training data. With an artifact
+/// of other features of the model (`calm build --feature-variant`), grades those features.
 ///
 /// With --baseline, it also writes the scores of baselines (`calmwalk calm baseline`), such as llpr, each with its neighbourhood
 /// average (llpr_nbr). With --ensemble, force_deviation is the norm of the standard deviation of the forces of all models (eV/Å).
@@ -50,9 +51,12 @@ pub struct CalmScoreArgs {
     /// CALM artifact (gmm_artifacts.npz) [default: mixture in the model file]
     #[arg(long, value_name = "CALM.npz")]
     artifact: Option<PathBuf>,
-    /// Structures to grade, extended XYZ
+    /// Structures to grade: extended XYZ, POSCAR (.poscar, .vasp, POSCAR*, CONTCAR*) or text dumps of LAMMPS (.dump, .lammpstrj,
+    /// dump.*), each also with .gz or .zst; files of other names are read as extended XYZ
     #[arg(value_name = "IN.extxyz")]
     input: PathBuf,
+    #[command(flatten)]
+    reading: StructureReadingArgs,
     /// File for the graded structures; an existing file is replaced once all are graded
     #[arg(long, short, value_name = "OUT.extxyz")]
     output: PathBuf,
@@ -93,11 +97,8 @@ pub struct CalmScoreArgs {
 
 impl CalmScoreArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
-        for output in self.json.iter().chain(&self.table) {
-            let inputs = [(self.model.as_path(), "the model"), (self.input.as_path(), "the input")];
-            let artifact = self.artifact.as_deref().map(|path| (path, "the artifact"));
-            refuse_to_replace(output, inputs.into_iter().chain(artifact))?;
-        }
+        self.check_outputs()?;
+        let files = self.reading.single_file(&self.input)?;
         let (model, artifact) = load_any(&self.model, self.artifact.as_deref())?;
         let load_bounds =
             |path: &PathBuf| ScoreCalibration::load(path, &self.model, self.artifact.as_deref());
@@ -106,20 +107,35 @@ impl CalmScoreArgs {
         let mut others = others.with_averages(&self.gamma_nbr);
         let dimension = artifact.mixture.dimension();
         let mut scorer = Scorer::new(&model, Arc::new(artifact.mixture));
-        let mut frames = XyzReader::open(&self.input).map_err(CommandError::input)?;
-        let bar = Bar::new(frames.length, BAR);
+        let bytes = Arc::new(AtomicU64::new(0));
+        let mut frames = files.reader(Arc::clone(&bytes));
+        // A pipe has no length.
+        let bar = Bar::new(Some(files.total_bytes()?).filter(|length| *length > 0), BAR);
         let mut output = AtomicFile::create(&self.output)?;
         let cannot = |error| cannot_write(self.features.as_deref().unwrap_or(Path::new("")), error);
         let mut feature_file = self.features.as_deref().map(AtomicFile::create).transpose()?;
         let matrix = feature_file.as_mut().map(|file| feature_matrix(file, dimension));
         let mut matrix = matrix.transpose().map_err(cannot)?;
         let mut labels = ScoreLabels::new(others.score_columns(), self.table.as_deref(), bounds.is_some())?;
-        let mut count = 0_u64;
-        while let Some(frame) = frames.next() {
-            let mut frame = frame.map_err(CommandError::input)?;
+        let (mut count, mut left_out) = (0_u64, LeftOutStructures::default());
+        while let Some((mut frame, _)) = frames.next()? {
             let line = frame.line;
-            scorer.score(&frame.structure, self.gradient).map_err(|error| self.at(line, error))?;
-            let columns = others.columns(&frame.structure, &scorer).map_err(|error| self.at(line, error))?;
+            match scorer.score(&frame.structure, self.gradient) {
+                Ok(()) => (),
+                Err(error) if error.is_of_structure() => {
+                    left_out.add(self.place(line), error);
+                    continue;
+                }
+                Err(error) => return Err(self.at(line, error)),
+            }
+            let columns = match others.columns(&frame.structure, &scorer) {
+                Ok(columns) => columns,
+                Err(error) if error.is_of_structure() => {
+                    left_out.add(self.place(line), error);
+                    continue;
+                }
+                Err(error) => return Err(self.at(line, error)),
+            };
             let bound = bounds.as_mut().and_then(|bounds| bounds.bound(&frame.structure, &scorer.gamma_nbr));
             labels.add(&frame, &scorer, &columns, bound)?;
             write_scores(&mut frame, &scorer, self.gradient);
@@ -134,15 +150,13 @@ impl CalmScoreArgs {
                 matrix.extend(scorer.features().iter().copied()).map_err(cannot)?;
             }
             count += 1;
-            bar.set(frames.position(), || output::count(count, "frame"));
+            bar.set(bytes.load(Ordering::Relaxed), || output::count(count, "frame"));
         }
-        if count == 0 {
-            return Err(CommandError::input(FileError::Empty(self.input)));
-        }
+        drop(bar);
+        self.warn(&left_out, count)?;
         matrix.map_or(Ok(()), NpyWriter::finish).map_err(cannot)?;
         feature_file.map_or(Ok(()), AtomicFile::finish)?;
         output.finish()?;
-        drop(bar);
         print(|out| {
             writeln!(
                 out,
@@ -158,8 +172,40 @@ impl CalmScoreArgs {
         Ok(ExitStatus::Done)
     }
 
+    /// No output may replace a file that is read, or another output; the graded structures may replace the input.
+    fn check_outputs(&self) -> Result<(), CommandError> {
+        let artifact = self.artifact.iter().map(|path| (path, "the artifact"));
+        let baselines = self.baseline.iter().map(|path| (path, "a file of baselines"));
+        let ensemble = self.ensemble.iter().map(|path| (path, "a model of the ensemble"));
+        let calibration = self.calibration.iter().map(|path| (path, "the calibration"));
+        let others = artifact.chain(baselines).chain(ensemble).chain(calibration);
+        let inputs = std::iter::once((&self.model, "the model")).chain(others);
+        let inputs: Vec<_> = inputs.map(|(path, what)| (path.as_path(), what)).collect();
+        let further = || self.features.iter().chain(&self.json).chain(&self.table).map(PathBuf::as_path);
+        check_outputs(std::iter::once(self.output.as_path()).chain(further()), &inputs)?;
+        let input = (self.input.as_path(), "the input");
+        further().try_for_each(|output| refuse_to_replace(output, [input]))?;
+        if is_plain_extxyz(&self.input) { Ok(()) } else { refuse_to_replace(&self.output, [input]) }
+    }
+
+    /// Warns of structures that were left out. If the output replaces the input, they would be lost.
+    fn warn(&self, left_out: &LeftOutStructures, kept: u64) -> Result<(), CommandError> {
+        left_out.warn(kept)?;
+        if left_out.count() == 0 {
+            return Ok(());
+        }
+        refuse_to_replace(
+            &self.output,
+            [(self.input.as_path(), "the input, which has structures that were left out")],
+        )
+    }
+
+    fn place(&self, line: usize) -> FileLine {
+        FileLine { file: self.input.as_path().into(), line }
+    }
+
     fn at(&self, line: usize, error: impl std::fmt::Display) -> CommandError {
-        CommandError::Input(format!("{}:{line}: {error}", self.input.display()))
+        self.place(line).wrong(error)
     }
 }
 

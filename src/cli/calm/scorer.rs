@@ -43,6 +43,17 @@ pub enum ScoreError {
     Pair(#[from] PairError),
 }
 
+impl ScoreError {
+    /// Whether other structures may be graded.
+    pub fn is_of_structure(&self) -> bool {
+        match self {
+            Self::Features(error) => error.is_of_structure(),
+            Self::Grade(_) => true,
+            Self::Pair(_) => false,
+        }
+    }
+}
+
 impl Scorer {
     /// `mixture` must be one of these features.
     pub fn new(features: &FeatureModel, mixture: Arc<Mixture>) -> Self {

@@ -25,6 +25,7 @@ use crate::loaded_model::LoadedModel;
 use crate::output::{self, Bar, TextTable, decimals, print, print_stderr};
 use crate::page::{create_directory, write_files};
 use crate::signals::stop_token;
+use crate::structure_files::StructureReadingArgs;
 
 const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
@@ -62,14 +63,16 @@ pub struct CalmValidateArgs {
     /// with γ
     #[arg(long, value_name = "MODEL.npz")]
     ensemble: Vec<PathBuf>,
-    /// Structures with labels, extended XYZ. The page also shows how well γ, γ_nbr and the other scores of an atom predict large force
+    /// Structures with labels, extended XYZ, also packed (.gz, .zst). The page also shows how well γ, γ_nbr and the other scores of an atom predict large force
     /// errors. Several files are several sets, each with a section of its own, and a table with all of them
     #[arg(long, value_name = "LABELLED.extxyz", num_args = 1..)]
     labelled: Vec<PathBuf>,
-    /// Training data of the model, extended XYZ; several files are allowed. The solid solutions are drawn with the compositions and first
+    /// Training data of the model, in any format of `calm build`; several files are allowed. The solid solutions are drawn with the compositions and first
     /// shells of these structures, and the errors by composition with the errors of the model on them
     #[arg(long, value_name = "TRAINING.extxyz", num_args = 1..)]
     training: Vec<PathBuf>,
+    #[command(flatten)]
+    reading: StructureReadingArgs,
     /// Another model with a mixture in its file; may be repeated. Its force errors on the labelled structures are drawn by its own γ_nbr
     /// below those of the model
     #[arg(long, value_name = "MODEL.npz", requires = "labelled")]
@@ -157,10 +160,12 @@ impl CalmValidateArgs {
 
     /// The baselines, and what else labelled structures are scored by beside γ and γ_nbr. The output must not replace these structures.
     fn compared(&self, features: &FeatureModel) -> Result<OtherScores, CommandError> {
-        let structures = self.output.join("structures.extxyz");
         let labelled = self.labelled.iter().map(|path| (path.as_path(), "a file of labelled structures"));
         let training = self.training.iter().map(|path| (path.as_path(), "a file of training data"));
-        refuse_to_replace(&structures, labelled.chain(training))?;
+        let inputs: Vec<_> = labelled.chain(training).collect();
+        for written in ["structures.extxyz", "collisions.extxyz"] {
+            refuse_to_replace(&self.output.join(written), inputs.iter().copied())?;
+        }
         let ensemble: &[PathBuf] = if self.labelled.is_empty() { &[] } else { &self.ensemble };
         let others = OtherScores::load(&self.model, features, &self.baseline, ensemble)?;
         Ok(others.with_averages(&self.gamma_nbr))
@@ -204,8 +209,12 @@ impl CalmValidateArgs {
         settings: &ValidationSettings,
         stop: &CancellationToken,
     ) -> Result<Option<LabelledResults>, CommandError> {
+        let read = |paths: &[PathBuf]| -> Result<Vec<_>, _> {
+            paths.iter().map(|path| self.reading.single_file(path)).collect()
+        };
+        let (labelled, data) = (read(&self.labelled)?, read(&self.training)?);
         let (mut sets, mut training) = (Vec::new(), None);
-        for input in &self.labelled {
+        for input in &labelled {
             let mut scorer = own.scorer();
             let scores = (&mut scorer, &mut *others);
             let Some(set) = validate_labels::set(input, scores, comparison, &mut planes, stop)? else {
@@ -213,9 +222,9 @@ impl CalmValidateArgs {
             };
             sets.push(set);
         }
-        if !self.training.is_empty() {
+        if !data.is_empty() {
             let empty = TrainingCompositions::new(&settings.pairs);
-            training = validate_labels::training(&self.training, &mut own.scorer(), empty, stop)?;
+            training = validate_labels::training(&data, &mut own.scorer(), empty, stop)?;
             if training.is_none() {
                 return Ok(None);
             }

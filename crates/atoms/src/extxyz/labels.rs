@@ -51,22 +51,37 @@ impl Frame {
     /// volume; and `forces` over `force`, which QUIP writes. Of an asymmetric stress the upper triangle is
     /// used, as in ASE.
     pub fn labels(&self) -> Result<FrameLabels, LabelError> {
-        let reference = QUANTITIES.map(|quantity| format!("REF_{quantity}"));
-        let given = |key: &String| self.info.contains_key(key) || self.arrays.contains_key(key);
-        let prefix = if reference.iter().any(given) { "REF_" } else { "" };
-        let energy = match self.label(prefix, "energy", Self::energy)? {
-            None => self.label(prefix, "free_energy", Self::energy)?,
-            energy => energy,
-        };
+        let (energy, prefix) = (self.energy_label()?, self.label_prefix());
         let stress = match self.label(prefix, "stress", Self::matrix)? {
             None => self.label(prefix, "virial", Self::stress_from_virial)?,
             stress => stress,
         };
-        let forces = match self.forces(&format!("{prefix}forces"))? {
-            None => self.forces(&format!("{prefix}force"))?,
-            forces => forces,
-        };
-        Ok(FrameLabels { energy, forces, stress })
+        Ok(FrameLabels { energy, forces: self.force_labels()?, stress })
+    }
+
+    /// The energy of [`Self::labels`], whatever the others are.
+    pub fn energy_label(&self) -> Result<Option<f64>, LabelError> {
+        let prefix = self.label_prefix();
+        match self.label(prefix, "energy", Self::energy)? {
+            None => self.label(prefix, "free_energy", Self::energy),
+            energy => Ok(energy),
+        }
+    }
+
+    /// The forces of [`Self::labels`], whatever the others are.
+    pub fn force_labels(&self) -> Result<Option<Vec<Vec3>>, LabelError> {
+        let prefix = self.label_prefix();
+        match self.forces(&format!("{prefix}forces"))? {
+            None => self.forces(&format!("{prefix}force")),
+            forces => Ok(forces),
+        }
+    }
+
+    /// What precedes the names of the labels that are used.
+    fn label_prefix(&self) -> &'static str {
+        let reference = QUANTITIES.map(|quantity| format!("REF_{quantity}"));
+        let given = |key: &String| self.info.contains_key(key) || self.arrays.contains_key(key);
+        if reference.iter().any(given) { "REF_" } else { "" }
     }
 
     /// Replaces all labels of the frame, under any names.

@@ -4,6 +4,9 @@ use super::error::{BaselineError, check_element};
 use crate::grade::nearest;
 use crate::mixture::Mixture;
 
+/// Atoms of a group that are visited together: their rows, and products of these, stay in the cache.
+const BLOCK_ROWS: usize = 256;
+
 /// The groups, those of the first element first.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct AtomGroups {
@@ -23,11 +26,14 @@ impl AtomGroups {
         Self { dimension, centroids }
     }
 
-    /// One group for each component.
+    /// One group for each component with atoms. An element without atoms has no centroid: that of
+    /// [`crate::Component::unknown_element`] has no meaning.
     pub fn of_components(mixture: &Mixture) -> Self {
         let mut centroids = vec![Vec::new(); mixture.element_count()];
         for (element, _, component) in mixture.iter() {
-            centroids[element].extend_from_slice(component.centroid());
+            if component.statistics().is_none_or(|statistics| statistics.count > 0.0) {
+                centroids[element].extend_from_slice(component.centroid());
+            }
         }
         Self { dimension: mixture.dimension(), centroids }
     }
@@ -76,7 +82,8 @@ impl AtomGroups {
     }
 }
 
-/// Calls `visit` with each group that has atoms, the indices of its atoms, and their rows `[atoms × D]`.
+/// Calls `visit` with each group that has atoms, the indices of its atoms, and their rows `[atoms × D]`; several times with a group of more
+/// than [`BLOCK_ROWS`] atoms.
 pub(super) fn for_each_group(
     groups: &[usize],
     dimension: usize,
@@ -86,7 +93,8 @@ pub(super) fn for_each_group(
     let mut order: Vec<usize> = (0..groups.len()).collect();
     order.sort_by_key(|&atom| groups[atom]);
     let mut rows = Vec::new();
-    for atoms in order.chunk_by(|&a, &b| groups[a] == groups[b]) {
+    let all = order.chunk_by(|&a, &b| groups[a] == groups[b]);
+    for atoms in all.flat_map(|atoms| atoms.chunks(BLOCK_ROWS)) {
         rows.clear();
         atoms.iter().for_each(|atom| rows.extend_from_slice(&features[atom * dimension..][..dimension]));
         visit(groups[atoms[0]], atoms, &mut rows);

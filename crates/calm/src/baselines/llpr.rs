@@ -13,7 +13,7 @@ use super::max_vol::multiply_transposed;
 use super::settings::BaselineSettings;
 use crate::linear::{LinearError, dot, eigen, trace, view};
 
-/// Rows that are added to G at once.
+/// Rows of one matrix product.
 const BLOCK_ROWS: usize = 128;
 
 /// One Gram matrix for all elements.
@@ -64,8 +64,12 @@ impl Llpr {
 
     /// u of each row, `[n × D]`.
     pub(super) fn score_rows(&self, rows: &[f64]) -> Vec<f64> {
-        let white = multiply_transposed(rows, &self.whitening, self.dimension);
-        white.chunks_exact(self.dimension).map(|row| dot(row, row).sqrt()).collect()
+        let mut scores = Vec::with_capacity(rows.len() / self.dimension);
+        for rows in rows.chunks(BLOCK_ROWS * self.dimension) {
+            let white = multiply_transposed(rows, &self.whitening, self.dimension);
+            scores.extend(white.chunks_exact(self.dimension).map(|row| dot(row, row).sqrt()));
+        }
+        scores
     }
 
     /// As [`super::Baseline::score_forces`].

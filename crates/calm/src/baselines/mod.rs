@@ -81,8 +81,8 @@ impl Baseline {
         }
     }
 
-    /// One score for each atom, larger further outside; ∞ where the training data have no atom of its element.
-    /// `elements` has the element index of each atom, `features` is `[atoms × D]`.
+    /// One score for each atom, larger further outside; ∞ where the training data have no atom of its element, but not
+    /// with [`Llpr`], which has one matrix for all elements. `elements` has the element index of each atom, `features` is `[atoms × D]`.
     ///
     /// # Errors
     /// Wrong lengths, an unknown element, features that are not finite.

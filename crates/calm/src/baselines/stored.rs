@@ -176,11 +176,12 @@ impl<R: Read + Seek> Stored<'_, R> {
             .collect())
     }
 
+    /// An element without training atoms has no centroid in either case.
     fn groups(&self, of_components: bool) -> Result<AtomGroups, Error> {
         let (counts, sum) = self.counts("centroid_counts", self.elements, MOST_COMPONENTS)?;
-        if counts.iter().any(|count| (*count > 0) != of_components) {
-            let expected = if of_components { "centroids of every element" } else { "no centroids" };
-            return Err(self.file.invalid(&self.key("centroid_counts"), format!("{counts:?}"), expected));
+        if sum > 0 && !of_components {
+            let key = self.key("centroid_counts");
+            return Err(self.file.invalid(&key, format!("{counts:?}"), "no centroids"));
         }
         Ok(AtomGroups::of_centroids(self.dimension, self.rows("centroids", &counts, sum)?))
     }

@@ -1,8 +1,10 @@
 //! Files of baselines: a round trip preserves them, and hostile files are errors.
 
 use std::io::Cursor;
+use std::sync::Arc;
 
-use calm::baselines::{BaselineFile, BaselineKind, BaselineSettings, FeatureOrigin};
+use calm::baselines::{Baseline, BaselineFile, BaselineKind, BaselineSettings, FeatureOrigin};
+use calm::{Component, Mixture};
 use npz::{NpzFile, Writer};
 use proptest::prelude::*;
 
@@ -47,6 +49,24 @@ fn what_was_written_scores_the_same() {
             found.kind()
         );
         assert_eq!(found.score_forces(&features[..12]), baseline.score_forces(&features[..12]));
+    }
+}
+
+#[test]
+fn an_element_without_atoms_is_infinitely_far_away_but_for_llpr() {
+    let (dimension, frames) = (4, frames(3, 4, 1, 40));
+    let known = mixture(3, dimension, 1).components(0).unwrap().to_vec();
+    let unknown = vec![Arc::new(Component::unknown_element(dimension))];
+    let mixture = Mixture::new(0, vec![known, unknown]).unwrap();
+    let settings = BaselineSettings::default();
+    let build = |kind| built(kind, &settings, &frames, dimension, &mixture);
+    let file = BaselineFile { baselines: BaselineKind::ALL.map(build).to_vec(), ..stored() };
+    let found = read(&bytes(&file)).unwrap();
+    for baseline in file.baselines.iter().chain(&found.baselines) {
+        let (kind, scores) = (baseline.kind(), baseline.score(&[0, 1], &[0.9; 8]).unwrap());
+        let is_llpr = matches!(baseline, Baseline::Llpr(_));
+        assert!(scores[0].is_finite() && scores[1].is_finite() == is_llpr, "{kind} {scores:?}");
+        assert!(is_llpr || scores[1] == f64::INFINITY, "{kind} {scores:?}");
     }
 }
 
@@ -113,7 +133,7 @@ fn arrays_that_contradict_each_other_are_errors() {
     assert!(numbers("1_centroids", &[4, 4], |_| 1e200).contains("numbers up to"));
     assert!(counts("0_ranks", &[4, 4, 4]).contains("expected a list of 2"));
     assert!(counts("0_ranks", &[4, 5]).contains("expected indices from 0 to 4"));
-    assert!(counts("1_centroid_counts", &[0, 4]).contains("centroids of every element"));
+    assert!(counts("0_centroid_counts", &[0, 4]).contains("expected no centroids"));
     assert!(counts("1_centroid_counts", &[1, 4]).contains("'1_centroids'"));
     assert!(counts("7_counts", &[i64::MAX, i64::MAX]).contains("7_"));
     assert!(counts("8_counts", &[2, -1]).contains("8_counts"));

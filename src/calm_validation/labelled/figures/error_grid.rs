@@ -1,9 +1,10 @@
-//! Errors of the force components within and beyond γ_nbr = 1, a row of panels for each model and a column for each set of labelled
-//! structures (the paper's Fig. 5).
+//! Errors of the force components within and beyond γ_nbr = 1 (the paper's Fig. 5) and γ = 1 (Fig. S7), a row of panels for each model and
+//! a column for each set of labelled structures.
 
 use ::figures::{Anchor, Figure};
 
-use super::super::sets::LabelledSet;
+use super::super::report::{LabelledReport, ScoreReport};
+use super::super::sets::{ComparedModel, LabelledSet};
 use super::error_histograms::{PANEL, ROW, Split, draw_split, push_split, split};
 use crate::csv::Csv;
 use crate::page::style::{WIDTH, row};
@@ -14,16 +15,48 @@ const COLUMNS: usize = 2;
 /// Height above the first row, points.
 const TOP: f64 = 24.0;
 
-/// `None` for one model and one set, whose panel is in another figure, or without an error above zero.
-pub fn draw(sets: &[LabelledSet]) -> Option<FigureEntry> {
-    let panels: Vec<_> = sets.chunks(COLUMNS).flat_map(panels).collect();
+/// A grade whose limit divides the errors.
+struct GridScore {
+    /// Of the figure's files.
+    name: &'static str,
+    title: &'static str,
+    /// In captions.
+    symbol: &'static str,
+    of_report: fn(&LabelledReport) -> Option<&ScoreReport>,
+    of_model: fn(&ComparedModel) -> &ScoreReport,
+}
+
+const SCORES: [GridScore; 2] = [
+    GridScore {
+        name: "error-grid",
+        title: "Force errors by model and set",
+        symbol: "γ_{nbr}",
+        of_report: LabelledReport::average,
+        of_model: |model| &model.average,
+    },
+    GridScore {
+        name: "error-grid-gamma",
+        title: "Force errors by model and set, before averaging",
+        symbol: "γ",
+        of_report: LabelledReport::grade,
+        of_model: |model| &model.grade,
+    },
+];
+
+/// A figure for γ_nbr and one for γ. None for one model and one set, whose panels are in another figure, or without an error above zero.
+pub fn draw(sets: &[LabelledSet]) -> Vec<FigureEntry> {
+    SCORES.iter().filter_map(|score| draw_score(sets, score)).collect()
+}
+
+fn draw_score(sets: &[LabelledSet], score: &GridScore) -> Option<FigureEntry> {
+    let panels: Vec<_> = sets.chunks(COLUMNS).flat_map(|sets| panels(sets, score)).collect();
     if panels.iter().flatten().flatten().count() < 2 {
         return None;
     }
     let description =
         "Errors of the force components on either side of the limit, by model and set of structures";
     let height = ROW * panels.len() as f64 + 4.0;
-    let mut figure = Figure::new("error-grid", description, WIDTH, height);
+    let mut figure = Figure::new(score.name, description, WIDTH, height);
     let mut numbers = Csv::new(&["score", "low", "high", "within", "beyond"]);
     let mut letters = 'a'..='z';
     for (line, panels) in panels.iter().enumerate() {
@@ -35,25 +68,28 @@ pub fn draw(sets: &[LabelledSet]) -> Option<FigureEntry> {
             push_split(&mut numbers, split, title);
         }
     }
-    let caption = "Absolute errors of the force components of the sampled atoms with γ_{nbr} up to 1 (blue) and beyond it (red), each by \
-                   themselves, in ten bins a decade, with means, medians (eV Å^{−1}) and the share beyond. Rows, models, each with its own \
-                   mixture and its own errors; columns, sets of labelled structures. Insets, force error of an atom against γ_{nbr}; ρ, \
-                   Spearman’s.";
-    let drawn = Ok(FigureContent { figure, caption: caption.into(), numbers });
-    Some(FigureEntry { name: "error-grid".into(), title: "Force errors by model and set", drawn })
+    let symbol = score.symbol;
+    let caption = format!(
+        "Absolute errors of the force components of the sampled atoms with {symbol} up to 1 (blue) and beyond it (red), each by themselves, in \
+         ten bins a decade, with means, medians (eV Å^{{−1}}) and the share beyond. Rows, models, each with its own mixture and its own errors; \
+         columns, sets of labelled structures. Insets, force error of an atom against {symbol}; ρ, Spearman’s."
+    );
+    let drawn = Ok(FigureContent { figure, caption, numbers });
+    Some(FigureEntry { name: score.name.into(), title: score.title, drawn })
 }
 
 /// A panel with its title; `None` for a set without errors on either side of the limit.
 type GridPanel<'a> = Option<(String, Split<'a>)>;
 
 /// Rows of panels: the model of the scores, then the others. Rows without any panel are left out.
-fn panels(sets: &[LabelledSet]) -> Vec<Vec<GridPanel<'_>>> {
+fn panels<'a>(sets: &'a [LabelledSet], score: &GridScore) -> Vec<Vec<GridPanel<'a>>> {
     let models = sets.first().map_or(0, |set| set.models.len());
+    let GridScore { of_report, of_model, .. } = *score;
     let panel = |line: usize| {
         sets.iter().map(move |set| {
             let (model, score) = match line.checked_sub(1) {
-                None => ("model", set.report.average()?),
-                Some(k) => (set.models[k].model.as_str(), &set.models[k].average),
+                None => ("model", of_report(&set.report)?),
+                Some(k) => (set.models[k].model.as_str(), of_model(&set.models[k])),
             };
             Some((format!("{model}: {}", set.file), split(score)?))
         })
