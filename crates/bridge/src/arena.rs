@@ -2,6 +2,7 @@
 
 use std::fs::{File, OpenOptions};
 use std::io;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use memmap2::MmapMut;
@@ -10,7 +11,7 @@ use rustix::fs::{FallocateFlags, fallocate};
 /// The smallest arena, bytes.
 const SMALLEST: usize = 1 << 20;
 
-/// A file that grows. The server maps it again when its path has changed.
+/// A file that grows, for this user only. The server maps it again when its path has changed.
 #[derive(Debug)]
 pub(crate) struct Arena {
     directory: PathBuf,
@@ -38,7 +39,7 @@ impl Arena {
         self.remove();
         self.path = self.directory.join(unique_name(self.number));
         let size = bytes.next_power_of_two().max(SMALLEST);
-        let file = OpenOptions::new().read(true).write(true).create_new(true).open(&self.path)?;
+        let file = OpenOptions::new().read(true).write(true).create_new(true).mode(0o600).open(&self.path)?;
         self.is_named = true;
         // Without memory behind it, a write would kill the process.
         let map = fallocate(&file, FallocateFlags::empty(), 0, size as u64)
@@ -94,4 +95,20 @@ fn map(file: &File) -> io::Result<MmapMut> {
     // SAFETY: the file is new and has its full size. Only the server that this program started maps it too, and it writes only while
     // this program waits for its answer; whatever it writes, all of it are numbers of which any bits are valid.
     unsafe { MmapMut::map_mut(file) }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    #[test]
+    fn an_arena_is_for_this_user_only() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut arena = Arena::new(directory.path(), 0);
+        arena.reserve(100).unwrap();
+        let mode = std::fs::metadata(arena.path()).unwrap().permissions().mode();
+        assert_eq!(mode & 0o777, 0o600);
+    }
 }
