@@ -15,7 +15,7 @@ use crate::output::log_and_print;
 pub const NOT_DETERMINISTIC: &str = "the model gives other bits when a call is repeated";
 
 /// Starts the program of a model on each device, which ends with the last who uses it. Cancelling `stop` ends the start, and later
-/// restarts. With `same_bits`, all devices must give the same bits.
+/// restarts. With `same_bits`, all devices must give the same bits, also after a restart.
 ///
 /// # Errors
 /// A program that does not start, a model whose derivatives are wrong, or one that is another on another device.
@@ -28,7 +28,7 @@ pub fn start(
     let start_one = |settings: PythonSettings| {
         let label = if is_alone { "python".to_owned() } else { format!("python, {}", settings.device) };
         let progress = move |text: &str| log_and_print(format_args!("{label}: {text}"));
-        Device::start(settings, stop, progress).map(Arc::new)
+        Device::start(settings, same_bits, stop, progress).map(Arc::new)
     };
     let devices: Vec<Arc<Device>> = thread::scope(|scope| {
         let starting: Vec<_> =

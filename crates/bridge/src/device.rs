@@ -47,12 +47,14 @@ fn memory() -> PathBuf {
 }
 
 impl Device {
-    /// Starts a server, and tests its model. `progress` gets what is being done.
+    /// Starts a server, and tests its model. `progress` gets what is being done. With `same_bits`, a server that is started again later
+    /// must give the same bits.
     ///
     /// # Errors
     /// A server that does not start, or a model that fails the test.
     pub fn start(
         settings: PythonSettings,
+        same_bits: bool,
         stop: &CancellationToken,
         progress: impl Fn(&str) + Send + 'static,
     ) -> Result<Self, DeviceError> {
@@ -64,6 +66,7 @@ impl Device {
         let package = write_package()?;
         let setup = DeviceSetup {
             settings,
+            same_bits,
             package: package.path().to_owned(),
             memory: memory(),
             events: events.clone(),

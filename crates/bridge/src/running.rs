@@ -1,6 +1,6 @@
 //! The thread of a device while its server runs: takes calls, sends batches, and hands out results.
 
-use std::collections::{HashMap, HashSet, VecDeque};
+use std::collections::{HashMap, VecDeque};
 use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
@@ -14,6 +14,7 @@ use crate::events::DeviceEvent;
 use crate::faults::Fault;
 use crate::process::ServerEvent;
 use crate::recipient::Recipient;
+use crate::same_model::ModelReference;
 use crate::schedule::{DeviceBatch, Kind, Next, Schedule, Ticket};
 use crate::server::{Outstanding, Server, Synchronous};
 use crate::setup::DeviceSetup;
@@ -55,8 +56,9 @@ pub(crate) struct Running<'a> {
     pub progress: &'a dyn Fn(&str),
     pub server: Option<Server>,
     pub generation: u64,
-    pub identity: String,
-    pub reference: (BondGeometry, Vec<f64>),
+    pub test_structure: BondGeometry,
+    /// The model, and what it gave for the test structure at the start.
+    pub reference: ModelReference,
     pub schedule: Schedule,
     /// Keeps the size of batches for the next start.
     pub limit_file: Option<LimitFile>,
@@ -65,9 +67,12 @@ pub(crate) struct Running<'a> {
     pub calls: HashMap<u64, PendingCall>,
     pub sent: VecDeque<SentBatch>,
     pub suspects: Vec<Suspect>,
-    /// Calls that a failure has interrupted.
-    pub interrupted: HashSet<u64>,
+    /// How often the server has failed at each call that has no result yet.
+    pub crashes: HashMap<u64, u32>,
+    /// Failures of the server since its last answer to a client.
     pub failures: u32,
+    /// Calls that were refused since then because the server failed at them.
+    pub refusals: u32,
     pub next_id: u64,
     pub busy_since: Option<Instant>,
     pub started: Instant,
@@ -79,7 +84,7 @@ impl Running<'_> {
     pub fn run(&mut self) {
         loop {
             let next = self.dispatch();
-            let deadline = self.sent.front().map(|sent| sent.call.deadline);
+            let deadline = self.sent.front().map(|sent| sent.call.deadline());
             let until = [next, deadline].into_iter().flatten().min();
             let timeout = until.map_or(IDLE, |until| until.saturating_duration_since(Instant::now()));
             let is_open = match self.setup.incoming.recv_timeout(timeout) {
@@ -107,7 +112,8 @@ impl Running<'_> {
                     ServerEvent::Line(line) => self.take_answer(&line),
                     ServerEvent::Ended => {
                         let names = self.setup.settings.names();
-                        self.restart(Fault::Exited(format!("{names}: the server has exited")));
+                        let batch = self.take_oldest();
+                        self.restart(Fault::Exited(format!("{names}: the server has exited")), batch);
                     }
                 }
             }
@@ -167,6 +173,13 @@ impl Running<'_> {
                 self.busy_since.get_or_insert(now);
                 self.setup.note(|statistics| statistics.waited += waited);
             }
+            // It exited when it was idle, or while it computed the batch before.
+            Err(fault @ Fault::Exited(_)) => {
+                self.schedule.abort_newest();
+                self.schedule.put_back(batch.tickets());
+                let before = self.take_oldest();
+                self.restart(fault, before);
+            }
             Err(fault) => {
                 self.schedule.abort_newest();
                 self.handle_fault(fault, batch);
@@ -174,13 +187,18 @@ impl Running<'_> {
         }
     }
 
+    /// The calls that the server is working on.
+    fn take_oldest(&mut self) -> Vec<Ticket> {
+        self.sent.pop_front().map(|sent| sent.batch.tickets()).unwrap_or_default()
+    }
+
     fn write_and_send(&mut self, batch: &DeviceBatch) -> Result<Outstanding, Fault> {
-        let Self { server, calls, clients, reference, setup, .. } = self;
+        let Self { server, calls, clients, test_structure, setup, .. } = self;
         let server = server.as_mut().ok_or(Fault::Stopped)?;
         let settings = &setup.settings;
         let geometry = |ticket: &Ticket| match calls.get(&ticket.id).map(|call| &call.work) {
             Some(Work::Evaluate { geometry, .. }) => geometry,
-            _ => clients.get(&ticket.client).unwrap_or(&reference.0),
+            _ => clients.get(&ticket.client).unwrap_or(test_structure),
         };
         let cotangent = |ticket: &Ticket| match calls.get(&ticket.id).map(|call| &call.work) {
             Some(Work::PullBack { cotangent }) => Some(&cotangent[..]),
@@ -208,13 +226,17 @@ impl Running<'_> {
     fn take_answer(&mut self, line: &str) {
         let names = self.setup.settings.names();
         let Some(SentBatch { call, batch }) = self.sent.pop_front() else {
-            return self.restart(Fault::Nonsense(format!("{names}: an answer without a call")));
+            let fault = Fault::Nonsense(format!("{names}: an answer without a call"));
+            return self.restart(fault, Vec::new());
         };
+        let now = Instant::now();
+        if let Some(next) = self.sent.front_mut() {
+            next.call.begun = now;
+        }
         let Some(server) = &mut self.server else { return };
         match server.answer(line, &call, &names) {
             Ok((compiled, seconds)) => {
-                let now = Instant::now();
-                self.schedule.done(now);
+                self.schedule.done(now, now.duration_since(call.begun));
                 self.setup.note(|statistics| statistics.computed += seconds);
                 self.count(&call, &batch, compiled, now);
                 self.deliver(&call, &batch);
@@ -255,7 +277,8 @@ impl Running<'_> {
                 self.suspect(ticket, Ok(numbers));
                 continue;
             }
-            self.interrupted.remove(&ticket.id);
+            self.crashes.remove(&ticket.id);
+            (self.failures, self.refusals) = (0, 0);
             if let Some(call) = self.calls.remove(&ticket.id) {
                 call.recipient.answer(parts.len(), |out| parts.write(out));
                 if let Work::Evaluate { geometry, .. } = call.work {
@@ -263,17 +286,15 @@ impl Running<'_> {
                 }
             }
         }
-        if self.interrupted.is_empty() && self.suspects.is_empty() {
-            self.failures = 0;
-        }
     }
 
     fn check_deadline(&mut self) {
-        let is_over = |sent: &SentBatch| sent.call.deadline <= Instant::now();
+        let is_over = |sent: &SentBatch| sent.call.deadline() <= Instant::now();
         if let Some(sent) = self.sent.front().filter(|sent| is_over(sent)) {
-            let seconds = (sent.call.deadline - sent.call.sent).as_secs();
+            let seconds = sent.call.timeout.as_secs();
             let names = self.setup.settings.names();
-            self.restart(Fault::Timeout(format!("{names}: no answer for {seconds} s")));
+            let batch = self.take_oldest();
+            self.restart(Fault::Timeout(format!("{names}: no answer for {seconds} s")), batch);
         }
     }
 
@@ -320,7 +341,7 @@ impl Running<'_> {
             self.limit_bonds(bonds, is_device);
         }
         if let Some(fault) = fault {
-            self.restart(fault);
+            self.restart(fault, Vec::new());
         }
         for event in early {
             // A device that was closed meanwhile learns so again from its channel.
@@ -331,7 +352,7 @@ impl Running<'_> {
     fn count(&mut self, call: &Outstanding, batch: &DeviceBatch, compiled: bool, now: Instant) {
         let tickets = batch.tickets();
         let bonds: usize = tickets.iter().map(|one| one.shape.bonds).sum();
-        let seconds = now.duration_since(call.sent).as_secs_f64();
+        let seconds = now.duration_since(call.begun).as_secs_f64();
         self.setup.note(|statistics| {
             statistics.batches += 1;
             statistics.structures += tickets.len() as u64;

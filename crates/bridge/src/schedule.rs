@@ -11,7 +11,8 @@ use std::time::{Duration, Instant};
 
 use crate::shapes::Shape;
 
-/// How long an idle device waits for the rest of the pull-backs of a batch.
+/// How long an idle device waits at least for the rest of the pull-backs of a batch. It waits for half of the time that the evaluation
+/// took, if that is longer: to evaluate again takes twice that.
 const PULL_BACK_GRACE: Duration = Duration::from_millis(5);
 /// A client that has not called for so long does not take part.
 const ABSENT_AFTER: Duration = Duration::from_millis(500);
@@ -96,7 +97,7 @@ enum SlotState {
     /// Under way. Clients whose pull-backs will follow.
     Computing { members: Vec<(u64, bool)> },
     /// Evaluated. The pull-backs of its members, as far as they have come.
-    Kept { members: Vec<(u64, bool)>, arrived: Vec<Option<Ticket>>, since: Instant },
+    Kept { members: Vec<(u64, bool)>, arrived: Vec<Option<Ticket>>, until: Instant },
 }
 
 /// Calls that wait, and what is under way.
@@ -145,13 +146,35 @@ impl Schedule {
         if ticket.kind == Kind::PullBack {
             for slot in &mut self.slots {
                 let SlotState::Kept { members, arrived, .. } = slot else { continue };
-                if let Some(place) = members.iter().position(|(client, _)| *client == ticket.client) {
+                let is_of = |(client, follows): &(u64, bool)| *follows && *client == ticket.client;
+                if let Some(place) = members.iter().position(is_of) {
                     arrived[place] = Some(ticket);
                     return;
                 }
             }
+        } else {
+            self.forget_evaluations_of(ticket.client);
         }
         self.waiting.push_back(ticket);
+    }
+
+    /// A client evaluates anew: no pull-back of what it evaluated before will come.
+    fn forget_evaluations_of(&mut self, client: u64) {
+        for slot in &mut self.slots {
+            match slot {
+                SlotState::Free => {}
+                SlotState::Computing { members } => {
+                    members.iter_mut().filter(|one| one.0 == client).for_each(|one| one.1 = false);
+                }
+                SlotState::Kept { members, arrived, .. } => {
+                    let open = members.iter_mut().zip(arrived).filter(|(_, arrived)| arrived.is_none());
+                    open.filter(|(one, _)| one.0 == client).for_each(|(one, _)| one.1 = false);
+                    if members.iter().all(|(_, follows)| !follows) {
+                        *slot = SlotState::Free;
+                    }
+                }
+            }
+        }
     }
 
     /// Puts calls back in front of all others, for another try.
@@ -159,14 +182,15 @@ impl Schedule {
         tickets.into_iter().rev().for_each(|ticket| self.waiting.push_front(ticket));
     }
 
-    /// The server has answered its oldest batch. Clients of an evaluation may call for pull-backs from now on.
-    pub fn done(&mut self, now: Instant) {
+    /// The server has answered its oldest batch, which took it `time`. Clients of an evaluation may call for pull-backs from now on.
+    pub fn done(&mut self, now: Instant, time: Duration) {
         let Some(slot) = self.sent.pop_front() else { return };
         if let SlotState::Computing { members } = std::mem::take(&mut self.slots[slot])
             && members.iter().any(|(_, follows)| *follows)
         {
             let arrived = vec![None; members.len()];
-            self.slots[slot] = SlotState::Kept { members, arrived, since: now };
+            let until = now + PULL_BACK_GRACE.max(time / 2);
+            self.slots[slot] = SlotState::Kept { members, arrived, until };
         }
     }
 
@@ -211,11 +235,9 @@ impl Schedule {
         {
             return Next::Send(self.take(slot));
         }
-        match self.oldest_kept() {
-            Some((slot, since)) if is_idle && now.duration_since(since) >= PULL_BACK_GRACE => {
-                self.give_up_waiting(slot, now)
-            }
-            Some((_, since)) if is_idle => Next::WaitUntil(since + PULL_BACK_GRACE),
+        match self.first_kept() {
+            Some((slot, until)) if is_idle && now >= until => self.give_up_waiting(slot, now),
+            Some((_, until)) if is_idle => Next::WaitUntil(until),
             _ => Next::Wait,
         }
     }
@@ -230,12 +252,13 @@ impl Schedule {
         self.slots.iter().position(|slot| matches!(slot, SlotState::Free))
     }
 
-    fn oldest_kept(&self) -> Option<(DeviceSlot, Instant)> {
+    /// The slot that is given up first, and when.
+    fn first_kept(&self) -> Option<(DeviceSlot, Instant)> {
         let kept = self.slots.iter().enumerate().filter_map(|(slot, state)| match state {
-            SlotState::Kept { since, .. } => Some((slot, *since)),
+            SlotState::Kept { until, .. } => Some((slot, *until)),
             _ => None,
         });
-        kept.min_by_key(|(_, since)| *since)
+        kept.min_by_key(|(_, until)| *until)
     }
 
     /// Pulls back what has come, or frees the slot if nothing has.
@@ -340,8 +363,8 @@ mod tests {
     /// What happens to a schedule.
     #[derive(Clone, Copy, Debug)]
     enum Step {
-        /// A client without a call calls.
-        Call(u64),
+        /// A client without a call calls: with a bias, it pulls back what it has evaluated, or says that it will.
+        Call(u64, bool),
         /// The server answers.
         Answer,
         /// The server reports a fault of its oldest batch, whose calls are made again.
@@ -354,7 +377,7 @@ mod tests {
 
     fn steps() -> impl Strategy<Value = Vec<Step>> {
         let step = prop_oneof![
-            6 => (1..=CLIENTS).prop_map(Step::Call),
+            6 => (1..=CLIENTS, prop::bool::weighted(0.8)).prop_map(|(client, biased)| Step::Call(client, biased)),
             6 => Just(Step::Answer),
             1 => Just(Step::Fault),
             1 => Just(Step::Loss),
@@ -363,7 +386,7 @@ mod tests {
         prop::collection::vec(step, 1..200)
     }
 
-    /// A schedule with clients that evaluate, then pull back, and so on.
+    /// A schedule with clients that evaluate, then pull back or not, and so on.
     struct Simulation {
         schedule: Schedule,
         now: Instant,
@@ -371,24 +394,26 @@ mod tests {
         /// Calls that wait or are under way: number and client.
         open: BTreeSet<(u64, u64)>,
         sent: VecDeque<DeviceBatch>,
-        /// Clients whose next call is a pull-back.
-        evaluated: BTreeSet<u64>,
+        /// The last answered evaluation of clients, of which a pull-back may come.
+        evaluated: HashMap<u64, u64>,
+        /// The evaluations that each slot keeps: clients and numbers of calls.
+        kept: [Vec<(u64, u64)>; 2],
     }
 
     impl Simulation {
         fn new() -> Self {
             let schedule = Schedule::new(MOST);
-            let (open, sent, evaluated) = Default::default();
-            Self { schedule, now: Instant::now(), next_id: 1, open, sent, evaluated }
+            let (open, sent, evaluated, kept) = Default::default();
+            Self { schedule, now: Instant::now(), next_id: 1, open, sent, evaluated, kept }
         }
 
-        fn call(&mut self, client: u64) {
+        fn call(&mut self, client: u64, biased: bool) {
             if self.open.iter().any(|(_, known)| *known == client) {
                 return;
             }
-            let kind = match self.evaluated.contains(&client) {
+            let kind = match biased && self.evaluated.contains_key(&client) {
                 true => Kind::PullBack,
-                false => Kind::Evaluate { follows: true, features: true },
+                false => Kind::Evaluate { follows: biased, features: true },
             };
             let shape = Shape { structures: 1, atoms: 4, bonds: 10 };
             let (id, since) = (self.next_id, self.now);
@@ -399,16 +424,16 @@ mod tests {
 
         fn step(&mut self, step: Step) {
             match step {
-                Step::Call(client) => self.call(client),
+                Step::Call(client, biased) => self.call(client, biased),
                 Step::Wait(time) => self.now += Duration::from_millis(time),
                 Step::Answer => {
                     let Some(batch) = self.sent.pop_front() else { return };
-                    self.schedule.done(self.now);
+                    self.schedule.done(self.now, Duration::from_millis(1));
                     for ticket in batch.tickets() {
                         assert!(self.open.remove(&(ticket.id, ticket.client)), "answered twice: {ticket:?}");
                         match ticket.kind {
                             Kind::PullBack => self.evaluated.remove(&ticket.client),
-                            Kind::Evaluate { .. } => self.evaluated.insert(ticket.client),
+                            Kind::Evaluate { .. } => self.evaluated.insert(ticket.client, ticket.id),
                         };
                     }
                 }
@@ -433,14 +458,36 @@ mod tests {
                 assert!(
                     tickets.len() == 1 || tickets.iter().all(|one| !one.alone || one.kind == Kind::PullBack)
                 );
-                let is_kept = matches!(batch, DeviceBatch::PullBackKept { .. });
                 let is_pull_back = !matches!(batch, DeviceBatch::Evaluate { .. });
                 for ticket in &tickets {
                     assert_eq!(ticket.kind == Kind::PullBack, is_pull_back, "{batch:?}");
-                    assert!(!is_kept || self.evaluated.contains(&ticket.client));
                 }
+                self.check_places(&batch);
                 self.sent.push_back(batch);
                 assert!(self.sent.len() <= AHEAD);
+            }
+        }
+    }
+
+    impl Simulation {
+        /// What a slot has evaluated, and that each pull-back is that of the last evaluation of its client.
+        fn check_places(&mut self, batch: &DeviceBatch) {
+            match batch {
+                DeviceBatch::Evaluate { slot, tickets } => {
+                    self.kept[*slot] = tickets.iter().map(|one| (one.client, one.id)).collect();
+                }
+                DeviceBatch::PullBackAnew { slot, .. } => self.kept[*slot].clear(),
+                DeviceBatch::PullBackKept { slot, tickets } => {
+                    assert_eq!(tickets.len(), self.kept[*slot].len(), "{batch:?}");
+                    for (ticket, (client, id)) in tickets.iter().zip(&self.kept[*slot]) {
+                        let Some(ticket) = ticket else { continue };
+                        assert_eq!(
+                            (ticket.client, self.evaluated.get(client)),
+                            (*client, Some(id)),
+                            "{batch:?}"
+                        );
+                    }
+                }
             }
         }
     }
@@ -464,7 +511,7 @@ mod tests {
     fn pull_backs_use_the_kept_evaluation() {
         let mut simulation = Simulation::new();
         let calls = |simulation: &mut Simulation, clients: &[u64]| {
-            clients.iter().for_each(|client| simulation.step(Step::Call(*client)));
+            clients.iter().for_each(|client| simulation.step(Step::Call(*client, true)));
         };
         // Everyone is known to take part.
         for client in [1, 1, 2, 2, 3, 3, 4, 4] {
@@ -474,7 +521,7 @@ mod tests {
         calls(&mut simulation, &[1, 2, 3, 4]);
         simulation.step(Step::Answer);
         assert_eq!(simulation.sent[0].tickets().len(), 3, "the three that came while the device computed");
-        simulation.step(Step::Call(1));
+        simulation.step(Step::Call(1, true));
         simulation.step(Step::Answer);
         calls(&mut simulation, &[2, 3]);
         let first = simulation.sent.front().cloned();
@@ -483,11 +530,49 @@ mod tests {
             "{first:?}"
         );
         simulation.step(Step::Answer);
-        simulation.step(Step::Call(4));
+        simulation.step(Step::Call(4, true));
         let second = simulation.sent.front().cloned();
         assert!(
             matches!(&second, Some(DeviceBatch::PullBackKept { tickets, .. }) if tickets.len() == 3),
             "{second:?}"
         );
+    }
+
+    /// A client that did not announce a pull-back, and was evaluated beside one that did, is pulled back where it was evaluated last.
+    #[test]
+    fn a_pull_back_is_that_of_the_last_evaluation() {
+        let mut simulation = Simulation::new();
+        // 1 and 2 call while the server has two batches, and are evaluated together in the first slot.
+        let busy = [(3, true), (4, false), (3, true), (1, false), (2, true)]
+            .map(|(client, biased)| Step::Call(client, biased));
+        let [first, others @ ..] = busy;
+        [first, Step::Answer].into_iter().chain(others).for_each(|step| simulation.step(step));
+        assert_eq!(simulation.sent.len(), 2);
+        [Step::Answer; 3].into_iter().for_each(|step| simulation.step(step));
+        let together: Vec<u64> = simulation.kept[0].iter().map(|(client, _)| *client).collect();
+        assert_eq!(together, [1, 2]);
+        simulation.evaluated.remove(&1);
+        simulation.step(Step::Call(1, true));
+        simulation.step(Step::Answer);
+        simulation.step(Step::Call(1, true));
+        let batch = simulation.sent.front().cloned();
+        assert!(
+            matches!(&batch, Some(DeviceBatch::PullBackKept { tickets, .. }) if tickets.len() == 1),
+            "{batch:?}"
+        );
+    }
+
+    /// An idle device waits for pull-backs for half of the time that the evaluation took.
+    #[test]
+    fn the_wait_for_pull_backs_grows_with_the_evaluation() {
+        let mut simulation = Simulation::new();
+        simulation.step(Step::Call(1, true));
+        let now = simulation.now;
+        simulation.schedule.done(now, Duration::from_millis(80));
+        let until = now + Duration::from_millis(40);
+        assert_eq!(simulation.schedule.next(now), Next::WaitUntil(until));
+        assert_eq!(simulation.schedule.next(until), Next::Wait, "it is given up");
+        simulation.schedule.add(Ticket { kind: Kind::PullBack, ..simulation.sent[0].tickets()[0] });
+        assert!(matches!(simulation.schedule.next(until), Next::Send(DeviceBatch::PullBackAnew { .. })));
     }
 }

@@ -27,8 +27,17 @@ pub(crate) struct Outstanding {
     pub id: u64,
     pub kind: BatchKind,
     pub slot: usize,
-    pub sent: Instant,
-    pub deadline: Instant,
+    /// When the server could begin with it: it was sent, and the call before it was answered.
+    pub begun: Instant,
+    /// Time for it from then on.
+    pub timeout: Duration,
+}
+
+impl Outstanding {
+    /// When its answer is overdue.
+    pub fn deadline(&self) -> Instant {
+        self.begun + self.timeout
+    }
 }
 
 /// A started server that has said hello.
@@ -37,7 +46,7 @@ pub(crate) struct Server {
     generation: u64,
     pub description: ModelDescription,
     pub arenas: [BatchArena; 2],
-    /// Shapes that were evaluated or pulled back since the start: later calls of them are quick.
+    /// Shapes ([`Self::program_shape`]) that were evaluated or pulled back since the start: later calls of them are quick.
     known_shapes: HashSet<(Shape, bool)>,
     next_id: u64,
     /// Id of the last evaluation in each arena.
@@ -134,13 +143,23 @@ impl Server {
         };
         self.evaluations[slot] = evaluates.is_some().then_some(id);
         let arena = &self.arenas[slot];
-        let is_known = self.known_shapes.contains(&(arena.shape(), evaluates.is_some()));
+        let is_known = self.known_shapes.contains(&(self.program_shape(slot), evaluates.is_some()));
         let timeout = if is_known { settings.timeout } else { settings.compile_timeout };
         let message = arena.message(id, kind);
         let sent = self.process.send(&message);
         sent.map_err(|error| Fault::Exited(format!("{}: {error}", settings.names())))?;
-        let now = Instant::now();
-        Ok(Outstanding { id, kind, slot, sent: now, deadline: now + timeout })
+        Ok(Outstanding { id, kind, slot, begun: Instant::now(), timeout })
+    }
+
+    /// What decides whether a framework has a program for the batch of a slot. Without padding there is a new number of bonds in nearly
+    /// every batch, and a program is not made for each: only the size of the batch counts.
+    fn program_shape(&self, slot: usize) -> Shape {
+        let shape = self.arenas[slot].shape();
+        if self.description.padding {
+            shape
+        } else {
+            Shape { atoms: shape.atoms.next_power_of_two(), ..Shape::default() }
+        }
     }
 
     /// Takes in the answer to the oldest call. Returns whether the shape was new, and the time that the adapter took, s.
@@ -151,7 +170,7 @@ impl Server {
         let reply = Reply::read(line, Some(call.id), names)?;
         let evaluates = matches!(call.kind, BatchKind::Evaluate { .. });
         self.arenas[call.slot].unlink();
-        let is_new = self.known_shapes.insert((self.arenas[call.slot].shape(), evaluates));
+        let is_new = self.known_shapes.insert((self.program_shape(call.slot), evaluates));
         Ok((reply.compiled || (is_new && self.description.padding), reply.seconds))
     }
 }
@@ -234,7 +253,7 @@ impl Synchronous<'_> {
         let generation = self.server.generation;
         let wait = Wait { setup: self.setup, generation, early: self.early };
         let what = if evaluates.is_some() { "evaluate" } else { "pull_back" };
-        let line = wait.line(call.deadline, what)?;
+        let line = wait.line(call.deadline(), what)?;
         self.server.answer(&line, &call, &settings.names())?;
         let results = (0..structures.len()).map(|k| {
             let parts = self.server.arenas[0].result(k, call.kind);

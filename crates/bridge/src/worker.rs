@@ -1,6 +1,6 @@
 //! The thread of a device: starts its server and tests the model.
 
-use std::collections::{HashMap, HashSet, VecDeque};
+use std::collections::{HashMap, VecDeque};
 use std::sync::mpsc::SyncSender;
 use std::time::Instant;
 
@@ -73,39 +73,41 @@ fn begin<'a>(
     progress("testing the derivatives of the model");
     let names = || setup.settings.names();
     let refused = |source| DeviceError::SelfTest { names: names(), source };
-    let reference = self_test::reference(&subject).map_err(|error| refused(error.into()))?;
+    let test_structure = self_test::reference(&subject).map_err(|error| refused(error.into()))?;
     let mut calls = Synchronous { server: &mut server, setup, early, fault: None };
     let tested = self_test::run(&subject, &mut calls);
     if let Some(fault) = calls.fault.take() {
         return Err(start_error(server.end(fault)));
     }
     let report = tested.map_err(refused)?;
-    let found = calls.round_trip(&[&reference], None).map_err(start_error)?;
+    let found = calls.round_trip(&[&test_structure], None).map_err(start_error)?;
     let energies = found.into_iter().next().map(|one| one.energies).unwrap_or_default();
     let limit = description.max_structures.unwrap_or(u32::MAX).min(setup.settings.max_batch.get());
     let limit_file = LimitFile::new(&setup.settings, &description);
+    let reference = ModelReference { description, energies };
     let mut running = Running {
         setup,
         progress,
         server: Some(server),
         generation: 0,
-        identity: description.identity.clone(),
-        reference: (reference, energies.clone()),
+        test_structure,
+        reference: reference.clone(),
         schedule: Schedule::new(limit as usize),
         limit_file,
         clients: HashMap::new(),
         calls: HashMap::new(),
         sent: VecDeque::new(),
         suspects: Vec::new(),
-        interrupted: HashSet::new(),
+        crashes: HashMap::new(),
         failures: 0,
+        refusals: 0,
         next_id: REFERENCE + 1,
         busy_since: None,
         started: Instant::now(),
         given_up: None,
     };
     running.use_kept_limit();
-    Ok((running, DeviceInfo { reference: ModelReference { description, energies }, self_test: report }))
+    Ok((running, DeviceInfo { reference, self_test: report }))
 }
 
 fn start_error(fault: Fault) -> DeviceError {

@@ -11,9 +11,10 @@ Options, all with a default that does nothing:
 - `max_structures`: what hello reports
 - `memory_above`: a call with more structures than this is out of memory
 - `fault`, `fault_call`, `fault_at`: a fault at the n-th call (from 1) of a kind: hello, evaluate (default) or pull_back
+- `exit_at_atoms`: the process ends with status 3 at a call with a structure of so many atoms
 - `control`: path of a file, looked for at each evaluate and pull_back. It has a fault a line; it is removed when it
-  is read, and its faults happen at this and the next calls, one at each. "memory_above 8" sets that option and is not
-  a fault.
+  is read, and its faults happen at this and the next calls, one at each. "memory_above 8" and "base_seconds 0.5" set
+  these options and are no faults.
 - `count`: path of a file to which each call appends a line: kind, structures, atoms, bonds (with padding), real
   structures
 - `bend`: {"forces": 1.1, …} multiplies a result (forces, virials, gradients, gradient_virials) by a factor: a model
@@ -56,6 +57,7 @@ _DEFAULTS: dict[str, Any] = {
     "fault": None,
     "fault_call": "evaluate",
     "fault_at": 1,
+    "exit_at_atoms": None,
     "control": None,
     "count": None,
     "bend": {},
@@ -123,6 +125,8 @@ class Simulated:
         """The fault of a call that its result shows, and whether its shape is new."""
         self._note(call, batch)
         fault = self._strike(call)
+        if self._options["exit_at_atoms"] in np.bincount(batch.structure_of_atom):
+            os._exit(3)
         limit = self._options["memory_above"]
         if limit is not None and batch.real.structures > limit:
             raise MemoryError(f"{batch.real.structures} structures in a batch, room for {limit}")
@@ -166,6 +170,8 @@ class Simulated:
             name, _, value = line.partition(" ")
             if name == "memory_above":
                 self._options[name] = int(value) if value else None
+            elif name == "base_seconds":
+                self._options[name] = float(value)
             elif name in FAULTS:
                 self._pending.append(name)
             else:
