@@ -50,8 +50,13 @@ impl ServerProcess {
         let program = settings.program();
         let mut words = settings.launcher.iter().map(std::ffi::OsStr::new).chain([program.as_os_str()]);
         let mut command = Command::new(words.next().unwrap_or_default());
-        // Modules of the working directory would come before those of the environment.
-        command.args(words).args(["-m", "calmwalk.server"]).current_dir(package);
+        command.args(words).args(["-m", "calmwalk.server"]);
+        // Modules of the working directory would come before those of the environment. A launcher may have words that are relative paths.
+        if settings.launcher.is_empty() {
+            command.current_dir(package);
+        } else {
+            command.env("PYTHONSAFEPATH", "1");
+        }
         let path = match std::env::var_os("PYTHONPATH").filter(|path| !path.is_empty()) {
             None => package.as_os_str().to_owned(),
             Some(others) => {
