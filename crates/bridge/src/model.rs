@@ -129,7 +129,8 @@ impl ModelWithFeatures for PythonModel {
 pub struct PythonPotential {
     model: Arc<PythonModel>,
     client: Option<Client>,
-    topology: Option<Arc<Topology>>,
+    /// Of the last structure, and the build of its neighbour list.
+    topology: Option<(u64, Arc<Topology>)>,
     /// Of the last forward pass.
     energy: Evaluation,
     /// As the adapter gives them.
@@ -164,7 +165,7 @@ impl PythonPotential {
         }
         let species = self.model.element_indices(&structure.species)?;
         let topology = Topology::of(&species, neighbours, self.topology.as_ref());
-        self.topology = Some(Arc::clone(&topology));
+        self.topology = Some((neighbours.build_number(), Arc::clone(&topology)));
         let geometry = BondGeometry::of(structure, topology);
         let numbers = self.client()?.evaluate(geometry, (features, pull_back_follows))?;
         let n = structure.len();
