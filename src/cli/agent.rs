@@ -47,6 +47,14 @@ pub struct AgentArgs {
     /// Environment of a model in Python on this host, if it is not that of the configuration (potential.python.environment)
     #[arg(long, value_name = "DIR")]
     python_environment: Option<PathBuf>,
+    /// Words before the Python program of a model in Python on this host, one at a time, if they are not those of the configuration
+    /// (potential.python.launcher); --python-environment is then the program inside
+    #[arg(long = "python-launcher", value_name = "WORD", allow_hyphen_values = true)]
+    python_launcher: Vec<String>,
+    /// Directory in which frameworks of models in Python keep compiled programs on this host, if it is not that of the configuration
+    /// (potential.python.cache)
+    #[arg(long, value_name = "DIR")]
+    python_cache: Option<PathBuf>,
     /// Device that evaluates a model in Python on this host, such as cuda:1, if it is not that of the configuration
     /// (potential.python.device). Repeat it for several devices
     #[arg(long = "device", value_name = "NAME")]
@@ -87,9 +95,12 @@ impl AgentArgs {
             walkers,
             prefetch: self.prefetch,
         };
-        let absolute = |path: &PathBuf| std::path::absolute(path).map_err(CommandError::input);
-        let environment = self.python_environment.as_ref().map(absolute).transpose()?;
-        let python = HostPython { environment, devices: self.devices };
+        let python = HostPython {
+            environment: self.python_environment,
+            launcher: self.python_launcher,
+            cache: self.python_cache,
+            devices: self.devices,
+        };
         let watched = AgentState::default();
         block_on(async {
             if let Some(address) = self.metrics {

@@ -13,8 +13,9 @@ pub(crate) enum DeviceEvent {
     Call { client: u64, call: Result<Call, String>, recipient: Recipient },
     /// A server has something to say.
     Server { generation: u64, event: ServerEvent },
-    /// Evaluate copies of a structure in batches of all sizes, so that programs are compiled and memory is known.
-    WarmUp { geometry: BondGeometry, most: usize, done: SyncSender<()> },
+    /// Evaluate copies of a structure in batches of all sizes, so that programs are compiled and memory is known. `done` gets whether each
+    /// copy has the same bits.
+    WarmUp { geometry: BondGeometry, most: usize, done: SyncSender<bool> },
     /// The device ends.
     Close,
 }

@@ -223,7 +223,7 @@ impl Running<'_> {
             )));
         }
         let mut calls = Synchronous { server, setup, early, fault: None };
-        let found = calls.round_trip(&[&self.test_structure], None)?;
+        let found = calls.round_trip(0, &[&self.test_structure], None)?;
         let energies = found.into_iter().next().map(|one| one.energies).unwrap_or_default();
         reference.check(&ModelReference { description, energies }, setup.same_bits).map_err(changed)
     }

@@ -4,11 +4,10 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
-use tracing::{info, warn};
+use tracing::warn;
 
 use crate::batch_limit::LimitFile;
 use crate::call::{BondGeometry, Call};
-use crate::description::AdapterFeatures;
 use crate::error::CallError;
 use crate::events::DeviceEvent;
 use crate::faults::Fault;
@@ -16,9 +15,8 @@ use crate::process::ServerEvent;
 use crate::recipient::Recipient;
 use crate::same_model::ModelReference;
 use crate::schedule::{DeviceBatch, Kind, Next, Schedule, Ticket};
-use crate::server::{Outstanding, Server, Synchronous};
+use crate::server::{Outstanding, Server};
 use crate::setup::DeviceSetup;
-use crate::shapes::Shape;
 
 /// The call of the reference structure.
 pub(crate) const REFERENCE: u64 = 0;
@@ -118,8 +116,7 @@ impl Running<'_> {
                 }
             }
             DeviceEvent::WarmUp { geometry, most, done } => {
-                self.warm_up(&geometry, most);
-                let _ = done.send(());
+                let _ = done.send(self.warm_up(&geometry, most));
             }
             DeviceEvent::Close => return false,
         }
@@ -295,57 +292,6 @@ impl Running<'_> {
             let names = self.setup.settings.names();
             let batch = self.take_oldest();
             self.restart(Fault::Timeout(format!("{names}: no answer for {seconds} s")), batch);
-        }
-    }
-
-    /// Evaluates batches of one, two, four … copies, so that their programs are compiled, and finds how many fit into the memory.
-    fn warm_up(&mut self, geometry: &BondGeometry, most: usize) {
-        let Some(server) = self.server.as_mut().filter(|_| self.sent.is_empty()) else { return };
-        let has_features = server.description.features.form != AdapterFeatures::None;
-        let dimension = if has_features { server.description.features.dimension } else { 0 };
-        let cotangent = vec![0.0; geometry.positions.len() * dimension];
-        let mut early = Vec::new();
-        let mut fault = None;
-        let mut copies = 1;
-        let Shape { bonds, .. } = geometry.shape();
-        let fits = |copies: usize, schedule: &Schedule| {
-            copies <= most.min(schedule.max_structures())
-                && (copies == 1 || copies * bonds <= schedule.max_bonds())
-        };
-        let mut found = None;
-        while fits(copies, &self.schedule) {
-            (self.progress)(&format!("preparing batches of {copies}"));
-            let structures = vec![geometry; copies];
-            let mut calls = Synchronous { server, setup: self.setup, early: &mut early, fault: None };
-            let made = calls.round_trip(&structures, None).and_then(|_| match has_features {
-                true => calls.round_trip(&structures, Some(&vec![&cotangent[..]; copies])).map(drop),
-                false => Ok(()),
-            });
-            match made {
-                Ok(()) => copies *= 2,
-                Err(short @ (Fault::Memory(_) | Fault::Arena(_))) if copies > 1 => {
-                    info!(
-                        message = short.message(),
-                        copies, "the memory of the device takes fewer structures"
-                    );
-                    found = Some((bonds * copies / 2, matches!(short, Fault::Memory(_))));
-                    break;
-                }
-                Err(other) => {
-                    fault = Some(other);
-                    break;
-                }
-            }
-        }
-        if let Some((bonds, is_device)) = found {
-            self.limit_bonds(bonds, is_device);
-        }
-        if let Some(fault) = fault {
-            self.restart(fault, Vec::new());
-        }
-        for event in early {
-            // A device that was closed meanwhile learns so again from its channel.
-            self.handle(event);
         }
     }
 

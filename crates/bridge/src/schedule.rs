@@ -19,6 +19,9 @@ const ABSENT_AFTER: Duration = Duration::from_millis(500);
 /// Batches that a server has at a time: the one that it computes and the next one.
 const AHEAD: usize = 2;
 
+/// Number of slots.
+pub(crate) const SLOTS: usize = 2;
+
 /// Number of one of the two slots.
 pub type DeviceSlot = usize;
 
@@ -103,18 +106,20 @@ enum SlotState {
 /// Calls that wait, and what is under way.
 #[derive(Clone, Debug)]
 pub struct Schedule {
-    slots: [SlotState; 2],
+    slots: [SlotState; SLOTS],
     /// Slots of the batches that the server has, in order.
     sent: VecDeque<DeviceSlot>,
     waiting: VecDeque<Ticket>,
     last_call: HashMap<u64, Instant>,
     max_structures: usize,
     max_bonds: usize,
+    /// Whether batches are padded to powers of two of structures.
+    padding: bool,
 }
 
 impl Schedule {
-    /// A schedule for batches of at most this many structures.
-    pub fn new(max_structures: usize) -> Self {
+    /// A schedule for batches of at most this many structures, which are padded if the framework compiles for each shape.
+    pub fn new(max_structures: usize, padding: bool) -> Self {
         Self {
             slots: Default::default(),
             sent: VecDeque::new(),
@@ -122,7 +127,13 @@ impl Schedule {
             last_call: HashMap::new(),
             max_structures: max_structures.max(1),
             max_bonds: usize::MAX,
+            padding,
         }
+    }
+
+    /// Bonds that the device computes for a batch: with padding, those of as many more such structures as there is room for.
+    fn computed_bonds(&self, structures: usize, bonds: usize) -> usize {
+        if self.padding { bonds * structures.next_power_of_two() / structures } else { bonds }
     }
 
     /// Largest number of structures of a batch.
@@ -303,12 +314,12 @@ impl Schedule {
         let mut taken: Vec<Ticket> = Vec::new();
         let mut left = VecDeque::new();
         let mut bonds = 0;
-        for ticket in self.waiting.drain(..) {
+        for ticket in std::mem::take(&mut self.waiting) {
             let fits = match taken.first() {
                 None => true,
                 Some(first) => {
                     taken.len() < self.max_structures
-                        && bonds + ticket.shape.bonds <= self.max_bonds
+                        && self.computed_bonds(taken.len() + 1, bonds + ticket.shape.bonds) <= self.max_bonds
                         && !first.alone
                         && !ticket.alone
                         && is_pull_back(first) == is_pull_back(&ticket)
@@ -402,7 +413,7 @@ mod tests {
 
     impl Simulation {
         fn new() -> Self {
-            let schedule = Schedule::new(MOST);
+            let schedule = Schedule::new(MOST, false);
             let (open, sent, evaluated, kept) = Default::default();
             Self { schedule, now: Instant::now(), next_id: 1, open, sent, evaluated, kept }
         }
@@ -560,6 +571,23 @@ mod tests {
             matches!(&batch, Some(DeviceBatch::PullBackKept { tickets, .. }) if tickets.len() == 1),
             "{batch:?}"
         );
+    }
+
+    /// A batch is not larger than the memory takes, also with its padding.
+    #[test]
+    fn padding_counts_as_bonds() {
+        for (padding, most) in [(false, 5), (true, 4)] {
+            let mut schedule = Schedule::new(8, padding);
+            schedule.limit_bonds(50);
+            let shape = Shape { structures: 1, atoms: 4, bonds: 10 };
+            let kind = Kind::Evaluate { follows: true, features: true };
+            let now = Instant::now();
+            (1..9).for_each(|id| {
+                schedule.add(Ticket { id, client: id, kind, shape, since: now, alone: false })
+            });
+            let Next::Send(batch) = schedule.next(now) else { panic!("nothing is sent") };
+            assert_eq!(batch.tickets().len(), most);
+        }
     }
 
     /// An idle device waits for pull-backs for half of the time that the evaluation took.

@@ -233,30 +233,31 @@ pub(crate) struct Synchronous<'a> {
 }
 
 impl Synchronous<'_> {
-    /// Sends the batch in the first arena and waits.
+    /// Sends a batch in the arena of a slot and waits.
     ///
     /// # Errors
     /// Faults of the server.
     pub fn round_trip(
         &mut self,
+        slot: usize,
         structures: &[&BondGeometry],
         cotangents: Option<&[&[f64]]>,
     ) -> Result<Vec<TestResult>, Fault> {
         let settings = &self.setup.settings;
-        self.server.write(0, structures)?;
+        self.server.write(slot, structures)?;
         if let Some(cotangents) = cotangents {
-            self.server.arenas[0].write_cotangents(cotangents.iter().map(|one| Some(*one)));
+            self.server.arenas[slot].write_cotangents(cotangents.iter().map(|one| Some(*one)));
         }
         let has_features = self.server.description.features.form != AdapterFeatures::None;
         let evaluates = cotangents.is_none().then_some(has_features);
-        let call = self.server.send(0, evaluates, settings)?;
+        let call = self.server.send(slot, evaluates, settings)?;
         let generation = self.server.generation;
         let wait = Wait { setup: self.setup, generation, early: self.early };
         let what = if evaluates.is_some() { "evaluate" } else { "pull_back" };
         let line = wait.line(call.deadline(), what)?;
         self.server.answer(&line, &call, &settings.names())?;
         let results = (0..structures.len()).map(|k| {
-            let parts = self.server.arenas[0].result(k, call.kind);
+            let parts = self.server.arenas[slot].result(k, call.kind);
             match parts.not_finite() {
                 Some(what) => Err(Fault::Reported(format!("{}, {what}", settings.names()))),
                 None => Ok(TestResult {
@@ -281,7 +282,7 @@ impl Synchronous<'_> {
 
 impl Evaluate for Synchronous<'_> {
     fn evaluate(&mut self, structures: &[&BondGeometry]) -> Result<Vec<TestResult>, String> {
-        let result = self.round_trip(structures, None);
+        let result = self.round_trip(0, structures, None);
         self.keep_fault(result)
     }
 
@@ -290,7 +291,7 @@ impl Evaluate for Synchronous<'_> {
         structures: &[&BondGeometry],
         cotangents: &[&[f64]],
     ) -> Result<Vec<TestResult>, String> {
-        let result = self.round_trip(structures, Some(cotangents));
+        let result = self.round_trip(0, structures, Some(cotangents));
         self.keep_fault(result)
     }
 }

@@ -80,7 +80,7 @@ fn begin<'a>(
         return Err(start_error(server.end(fault)));
     }
     let report = tested.map_err(refused)?;
-    let found = calls.round_trip(&[&test_structure], None).map_err(start_error)?;
+    let found = calls.round_trip(0, &[&test_structure], None).map_err(start_error)?;
     let energies = found.into_iter().next().map(|one| one.energies).unwrap_or_default();
     let limit = description.max_structures.unwrap_or(u32::MAX).min(setup.settings.max_batch.get());
     let limit_file = LimitFile::new(&setup.settings, &description);
@@ -92,7 +92,7 @@ fn begin<'a>(
         generation: 0,
         test_structure,
         reference: reference.clone(),
-        schedule: Schedule::new(limit as usize),
+        schedule: Schedule::new(limit as usize, reference.description.padding),
         limit_file,
         clients: HashMap::new(),
         calls: HashMap::new(),

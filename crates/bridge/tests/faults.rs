@@ -296,4 +296,12 @@ fn models_that_are_not_reproducible_are_known() {
     let crowded = Fixture::new(json!({ "crowd": 1e-13 })).device().unwrap();
     let report = &crowded.info().self_test;
     assert!(report.is_deterministic && !report.is_batch_independent);
+    let pulled = Fixture::new(json!({ "crowd_gradients": 1e-13 })).device().unwrap();
+    assert!(!pulled.info().self_test.is_batch_independent);
+    // Some depend on it in large batches only.
+    for (crowd, most, are_same) in [("crowd", 4, true), ("crowd", 8, false), ("crowd_gradients", 8, false)] {
+        let large = Fixture::new(json!({ crowd: 1e-13, "crowd_above": 4 })).device().unwrap();
+        assert!(large.info().self_test.is_batch_independent);
+        assert_eq!(large.warm_up(&crystal(1, 0), 0.5, most), Ok(are_same), "{crowd} {most}");
+    }
 }

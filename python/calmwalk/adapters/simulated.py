@@ -21,7 +21,8 @@ Options, all with a default that does nothing:
   with wrong derivatives
 - `noise`: relative noise of the energies, another in each call: a model that is not deterministic
 - `order`: energies differ by this times the atom's index: a model that permutations change
-- `crowd`: energies differ by this times the number of structures: a model that the composition of a batch changes
+- `crowd`, `crowd_gradients`: energies, or gradients, differ by this times the number of structures beyond
+  `crowd_above`: a model that the composition of a batch changes
 
 Faults: "exit" (the process ends with status 3), "hang" (sleeps without end), "slow" (ten seconds more), "nan" (the
 first force, or gradient, is not a number), "shape" (forces, or gradients, of one atom less), "type" (of whole
@@ -64,6 +65,8 @@ _DEFAULTS: dict[str, Any] = {
     "noise": 0.0,
     "order": 0.0,
     "crowd": 0.0,
+    "crowd_gradients": 0.0,
+    "crowd_above": 0,
 }
 
 
@@ -116,6 +119,8 @@ class Simulated:
         result = self._radial.pull_back(batch, feature_cotangents, energy_cotangents)
         bend = self._options["bend"]
         result.gradients = _spoil(fault, result.gradients * bend.get("gradients", 1.0))
+        if self._options["crowd_gradients"] and self._crowd(batch):
+            result.gradients = result.gradients + self._options["crowd_gradients"] * self._crowd(batch)
         result.virials = result.virials * bend.get("gradient_virials", 1.0)
         result.compiled = compiled
         self._end(started, batch, compiled)
@@ -190,8 +195,11 @@ class Simulated:
         if options["order"]:
             energies = energies + options["order"] * np.arange(len(energies))
         if options["crowd"]:
-            energies = energies + options["crowd"] * batch.n_structures
+            energies = energies + options["crowd"] * self._crowd(batch)
         return energies
+
+    def _crowd(self, batch: Batch) -> int:
+        return max(0, batch.n_structures - self._options["crowd_above"])
 
 
 def _happen(fault: str) -> None:
