@@ -92,7 +92,8 @@ fn faults_of_the_server_change_nothing() {
     );
     let wanted = wanted_faults();
     let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
-    let (usual, steps) = (format!("biased_steps = {STEPS_OF_20_FAULTS}"), STEPS_OF_20_FAULTS * wanted.div_ceil(20));
+    let (usual, steps) =
+        (format!("biased_steps = {STEPS_OF_20_FAULTS}"), STEPS_OF_20_FAULTS * wanted.div_ceil(20));
     assert!(text.contains(&usual));
     fs::write(here.join("campaign.toml"), text.replace(&usual, &format!("biased_steps = {steps}"))).unwrap();
     succeed(here, ["run", "campaign.toml", "--directory", "plain", "--in-process"]);
@@ -250,7 +251,8 @@ fn batches_of_the_campaign_have_the_same_bits() {
         let options = format!("options = {{ crowd = 1e-13, crowd_above = 4 }}\nmax_batch = {max_batch}");
         write_campaign(here, &adapter("simulated", &options));
         let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
-        let text = text.replace("walkers = 2", "walkers = 8").replace("biased_steps = 400", "biased_steps = 10");
+        let text =
+            text.replace("walkers = 2", "walkers = 8").replace("biased_steps = 400", "biased_steps = 10");
         fs::write(here.join("campaign.toml"), text).unwrap();
     };
     write(32);
@@ -322,7 +324,8 @@ fn mace_has_a_campaign() {
         "from ase.calculators.emt import EMT\n\nversion = \"1\"\n\n\ndef calculator():\n    return EMT()\n";
     fs::write(here.join("emt.py"), calculator).unwrap();
     build(here);
-    let validate = ["calm", "validate", "--model", "model.toml", "--artifact", "al.npz", "--output", "validation"];
+    let validate =
+        ["calm", "validate", "--model", "model.toml", "--artifact", "al.npz", "--output", "validation"];
     succeed(here, validate);
     assert!(here.join("validation/validation.html").exists());
     let seeds = config("data/aluminium_seeds.extxyz").display().to_string();

@@ -62,7 +62,11 @@ impl Topology {
     }
 
     /// The topology of a structure whose neighbour list is up to date; `last`, which was that of the build of a list, if it is the same.
-    pub(crate) fn of(species: &[usize], list: &NeighbourList, last: Option<&(u64, Arc<Self>)>) -> Arc<Self> {
+    pub(crate) fn from_list(
+        species: &[usize],
+        list: &NeighbourList,
+        last: Option<&(u64, Arc<Self>)>,
+    ) -> Arc<Self> {
         let is_same = |(build, last): &&(u64, Arc<Self>)| {
             let is_built = *build == list.build_number() || last.has_bonds_of(list);
             is_built && last.species.iter().map(|s| *s as usize).eq(species.iter().copied())
@@ -84,7 +88,7 @@ impl Topology {
 
 impl BondGeometry {
     /// The geometry of a structure with these bonds.
-    pub(crate) fn of(structure: &Structure, topology: Arc<Topology>) -> Self {
+    pub(crate) fn from_structure(structure: &Structure, topology: Arc<Topology>) -> Self {
         Self {
             topology,
             positions: structure.positions.clone(),

@@ -149,7 +149,7 @@ impl Device {
         let species = structure.species.iter().map(index).collect::<Result<Vec<_>, _>>()?;
         let mut list = NeighbourList::new(description.cutoff(), skin);
         list.update(structure).map_err(|error| error.to_string())?;
-        let geometry = BondGeometry::of(structure, Topology::of(&species, &list, None));
+        let geometry = BondGeometry::from_structure(structure, Topology::from_list(&species, &list, None));
         let (done, ended) = mpsc::sync_channel(1);
         // A thread that has crashed has refuted nothing.
         let is_sent = self.events.send(DeviceEvent::WarmUp { geometry, most, done }).is_ok();

@@ -18,7 +18,7 @@ const KEPT_LINES: usize = 12;
 /// How often an exit is looked for before the process is killed.
 const EXIT_POLLS: u32 = 20;
 
-/// What a server has to say.
+/// Events of a server process.
 #[derive(Debug)]
 pub(crate) enum ServerEvent {
     /// A line of its standard output.

@@ -6,33 +6,33 @@ use tracing::warn;
 
 use crate::error::CallError;
 use crate::events::DeviceEvent;
-use crate::faults::Fault;
-use crate::running::{REFERENCE, Running, Suspect, Work};
+use crate::faults::ServerFault;
 use crate::same_model::{ModelReference, have_same_energies};
-use crate::schedule::{DeviceBatch, Kind, Ticket};
+use crate::schedule::{DeviceBatch, Ticket, TicketKind};
 use crate::server::{Server, Synchronous};
+use crate::server_loop::{CallKind, REFERENCE, ServerLoop, SuspectResult};
 
 /// A server that fails so many times without an answer in between is given up, and a call that it fails at so many times is refused.
 const MAX_FAILURES: u32 = 3;
 
-impl Running<'_> {
+impl ServerLoop<'_> {
     /// Asks for a result once more, alone; if that has been tried, asks the reference structure.
     pub fn suspect(&mut self, ticket: Ticket, outcome: Result<Vec<f64>, String>) {
         if !ticket.alone {
             return self.schedule.put_back(vec![Ticket { alone: true, ..ticket }]);
         }
         if self.suspects.is_empty() {
-            let kind = Kind::Evaluate { follows: false, features: false };
+            let kind = TicketKind::Evaluate { follows: false, features: false };
             let shape = self.test_structure.shape();
             let reference =
                 Ticket { id: REFERENCE, client: REFERENCE, kind, shape, since: Instant::now(), alone: true };
             self.schedule.put_back(vec![reference]);
         }
-        self.suspects.push(Suspect { ticket, outcome });
+        self.suspects.push(SuspectResult { ticket, outcome });
     }
 
     /// Compares the reference structure with what it was at the start. If it is the same, suspicious results are those of the model.
-    pub fn judge(&mut self, energies: &[f64]) {
+    pub fn check_reference(&mut self, energies: &[f64]) {
         let expected = &self.reference.energies;
         if !have_same_energies(energies, expected) {
             let names = self.setup.settings.names();
@@ -43,14 +43,14 @@ impl Running<'_> {
                 sum(expected)
             );
             let suspects = std::mem::take(&mut self.suspects).into_iter().map(|suspect| suspect.ticket);
-            return self.restart(Fault::Nonsense(message), suspects.collect());
+            return self.restart(ServerFault::Nonsense(message), suspects.collect());
         }
-        for Suspect { ticket, outcome } in std::mem::take(&mut self.suspects) {
+        for SuspectResult { ticket, outcome } in std::mem::take(&mut self.suspects) {
             self.crashes.remove(&ticket.id);
             let Some(call) = self.calls.remove(&ticket.id) else { continue };
             match outcome {
                 Ok(numbers) => {
-                    if let Work::Evaluate { geometry, .. } = call.work {
+                    if let CallKind::Evaluate { geometry, .. } = call.work {
                         self.clients.insert(call.client, geometry);
                     }
                     call.recipient.answer(numbers.len(), |out| out.copy_from_slice(&numbers));
@@ -60,12 +60,12 @@ impl Running<'_> {
         }
     }
 
-    pub fn handle_fault(&mut self, fault: Fault, batch: DeviceBatch) {
+    pub fn handle_fault(&mut self, fault: ServerFault, batch: DeviceBatch) {
         let tickets = batch.tickets();
         let bonds: usize = tickets.iter().map(|one| one.shape.bonds).sum();
-        let is_device = matches!(fault, Fault::Memory(_));
+        let is_device = matches!(fault, ServerFault::Memory(_));
         match fault {
-            Fault::Memory(message) | Fault::Arena(message) if tickets.len() > 1 && bonds > 0 => {
+            ServerFault::Memory(message) | ServerFault::Arena(message) if tickets.len() > 1 && bonds > 0 => {
                 warn!(
                     message,
                     structures = tickets.len(),
@@ -76,16 +76,16 @@ impl Running<'_> {
                 self.setup.note(|statistics| statistics.last_failure = Some(message));
                 self.schedule.put_back(tickets);
             }
-            Fault::Reported(message) if tickets.iter().any(|one| one.id == REFERENCE) => {
-                self.restart(Fault::Nonsense(message), tickets);
+            ServerFault::Reported(message) if tickets.iter().any(|one| one.id == REFERENCE) => {
+                self.restart(ServerFault::Nonsense(message), tickets);
             }
-            Fault::Reported(message) => {
+            ServerFault::Reported(message) => {
                 warn!(message, "a call of the python server failed");
                 for ticket in tickets.into_iter().rev() {
                     self.suspect(ticket, Err(message.clone()));
                 }
             }
-            fault @ Fault::Arena(_) => {
+            fault @ ServerFault::Arena(_) => {
                 self.schedule.put_back(tickets);
                 self.restart(fault, Vec::new());
             }
@@ -121,7 +121,7 @@ impl Running<'_> {
 
     /// Ends the server and starts another one. Calls without results are made again; those that it `failed_at`, each alone. A call that
     /// it fails at again and again is refused, if the next server has the right results for the test structure.
-    pub fn restart(&mut self, fault: Fault, failed_at: Vec<Ticket>) {
+    pub fn restart(&mut self, fault: ServerFault, failed_at: Vec<Ticket>) {
         let refused = self.make_calls_again(failed_at);
         let fault = match self.server.take() {
             Some(server) => server.end(fault),
@@ -162,12 +162,12 @@ impl Running<'_> {
     }
 
     /// Ends the server and starts others until one is as at the start. Returns whether there is one; it is given up after `most` failures.
-    fn start_another(&mut self, mut fault: Fault, most: u32) -> bool {
+    fn start_another(&mut self, mut fault: ServerFault, most: u32) -> bool {
         loop {
             if let Some(server) = self.server.take() {
                 fault = server.end(fault);
             }
-            if fault == Fault::Stopped {
+            if fault == ServerFault::Stopped {
                 self.give_up("interrupted while the model's server was started again");
                 return false;
             }
@@ -191,17 +191,17 @@ impl Running<'_> {
             }
             for event in early {
                 if !self.handle(event) {
-                    fault = Fault::Stopped;
+                    fault = ServerFault::Stopped;
                 }
             }
-            if self.server.is_some() && fault != Fault::Stopped {
+            if self.server.is_some() && fault != ServerFault::Stopped {
                 return true;
             }
         }
     }
 
     /// Starts a server, whose model must be that of the first one.
-    fn start_server(&self, early: &mut Vec<DeviceEvent>) -> Result<Server, Fault> {
+    fn start_server(&self, early: &mut Vec<DeviceEvent>) -> Result<Server, ServerFault> {
         let mut server = Server::start(self.setup, self.generation, early)?;
         match self.check_model(&mut server, early) {
             Ok(()) => Ok(server),
@@ -209,10 +209,10 @@ impl Running<'_> {
         }
     }
 
-    fn check_model(&self, server: &mut Server, early: &mut Vec<DeviceEvent>) -> Result<(), Fault> {
+    fn check_model(&self, server: &mut Server, early: &mut Vec<DeviceEvent>) -> Result<(), ServerFault> {
         let Self { setup, reference, .. } = self;
         let names = setup.settings.names();
-        let changed = |why: String| Fault::Nonsense(format!("{names}: not as at the start: {why}"));
+        let changed = |why: String| ServerFault::Nonsense(format!("{names}: not as at the start: {why}"));
         let description = server.description.clone();
         reference.description.check_same(&description).map_err(changed)?;
         if setup.same_bits && reference.description.versions != description.versions {

@@ -3,7 +3,7 @@
 //! A device does one batch at a time and has two *slots*. A slot keeps what the pull-backs of its last evaluation need, until they have
 //! come or a moment has passed. While one slot computes, the other one fills, or its walkers grade their features.
 //!
-//! Nothing waits for company: an idle device takes whatever is there, in the order in which it came. A batch is sent ahead of the end of
+//! An idle device starts at once: it takes whatever is there, in the order in which it came. A batch is sent ahead of the end of
 //! the last one only if it is full, or if everyone who takes part is in one of the two.
 
 use std::collections::{HashMap, VecDeque};
@@ -17,7 +17,7 @@ const PULL_BACK_GRACE: Duration = Duration::from_millis(5);
 /// A client that has not called for so long does not take part.
 const ABSENT_AFTER: Duration = Duration::from_millis(500);
 /// Batches that a server has at a time: the one that it computes and the next one.
-const AHEAD: usize = 2;
+const MAX_IN_FLIGHT: usize = 2;
 
 /// Number of slots.
 pub(crate) const SLOTS: usize = 2;
@@ -27,7 +27,7 @@ pub type DeviceSlot = usize;
 
 /// What a call asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
+pub enum TicketKind {
     /// Energies; `follows`: the client will pull back.
     Evaluate {
         /// Whether a pull-back follows.
@@ -47,7 +47,7 @@ pub struct Ticket {
     /// Who called.
     pub client: u64,
     /// What for.
-    pub kind: Kind,
+    pub kind: TicketKind,
     /// Size of the structure.
     pub shape: Shape,
     /// When it came.
@@ -84,7 +84,7 @@ pub enum DeviceBatch {
 
 /// What to do next.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Next {
+pub enum NextBatch {
     /// Send this batch.
     Send(DeviceBatch),
     /// Nothing before this time, unless a call or an answer comes.
@@ -154,7 +154,7 @@ impl Schedule {
     /// A call has come.
     pub fn add(&mut self, ticket: Ticket) {
         self.last_call.insert(ticket.client, ticket.since);
-        if ticket.kind == Kind::PullBack {
+        if ticket.kind == TicketKind::PullBack {
             for slot in &mut self.slots {
                 let SlotState::Kept { members, arrived, .. } = slot else { continue };
                 let is_of = |(client, follows): &(u64, bool)| *follows && *client == ticket.client;
@@ -190,7 +190,12 @@ impl Schedule {
 
     /// Puts calls back in front of all others, for another try.
     pub fn put_back(&mut self, tickets: Vec<Ticket>) {
-        tickets.into_iter().rev().for_each(|ticket| self.waiting.push_front(ticket));
+        for ticket in tickets.into_iter().rev() {
+            if !is_pull_back(&ticket) {
+                self.forget_evaluations_of(ticket.client);
+            }
+            self.waiting.push_front(ticket);
+        }
     }
 
     /// The server has answered its oldest batch, which took it `time`. Clients of an evaluation may call for pull-backs from now on.
@@ -231,25 +236,25 @@ impl Schedule {
     }
 
     /// What to send, if anything. A batch counts as sent.
-    pub fn next(&mut self, now: Instant) -> Next {
-        if self.sent.len() >= AHEAD {
-            return Next::Wait;
+    pub fn next(&mut self, now: Instant) -> NextBatch {
+        if self.sent.len() >= MAX_IN_FLIGHT {
+            return NextBatch::Wait;
         }
         let is_idle = self.sent.is_empty();
         let complete = (0..self.slots.len()).find(|slot| self.is_complete(*slot));
         if let Some(slot) = complete {
-            return Next::Send(self.pull_back(slot));
+            return NextBatch::Send(self.pull_back(slot));
         }
         if let Some(slot) = self.free_slot()
             && !self.waiting.is_empty()
             && (is_idle || self.fills_a_batch() || self.all_are_here(now))
         {
-            return Next::Send(self.take(slot));
+            return NextBatch::Send(self.take(slot));
         }
         match self.first_kept() {
             Some((slot, until)) if is_idle && now >= until => self.give_up_waiting(slot, now),
-            Some((_, until)) if is_idle => Next::WaitUntil(until),
-            _ => Next::Wait,
+            Some((_, until)) if is_idle => NextBatch::WaitUntil(until),
+            _ => NextBatch::Wait,
         }
     }
 
@@ -273,10 +278,10 @@ impl Schedule {
     }
 
     /// Pulls back what has come, or frees the slot if nothing has.
-    fn give_up_waiting(&mut self, slot: DeviceSlot, now: Instant) -> Next {
-        let SlotState::Kept { arrived, .. } = &self.slots[slot] else { return Next::Wait };
+    fn give_up_waiting(&mut self, slot: DeviceSlot, now: Instant) -> NextBatch {
+        let SlotState::Kept { arrived, .. } = &self.slots[slot] else { return NextBatch::Wait };
         if arrived.iter().any(Option::is_some) {
-            return Next::Send(self.pull_back(slot));
+            return NextBatch::Send(self.pull_back(slot));
         }
         self.slots[slot] = SlotState::Free;
         self.next(now)
@@ -335,7 +340,7 @@ impl Schedule {
         self.waiting = left;
         self.sent.push_back(slot);
         let anew = taken.first().is_some_and(is_pull_back);
-        let follows = |ticket: &Ticket| matches!(ticket.kind, Kind::Evaluate { follows: true, .. });
+        let follows = |ticket: &Ticket| matches!(ticket.kind, TicketKind::Evaluate { follows: true, .. });
         let members = taken.iter().map(|ticket| (ticket.client, follows(ticket))).collect();
         self.slots[slot] = SlotState::Computing { members };
         if anew {
@@ -347,7 +352,7 @@ impl Schedule {
 }
 
 fn is_pull_back(ticket: &Ticket) -> bool {
-    ticket.kind == Kind::PullBack
+    ticket.kind == TicketKind::PullBack
 }
 
 impl DeviceBatch {
@@ -423,8 +428,8 @@ mod tests {
                 return;
             }
             let kind = match biased && self.evaluated.contains_key(&client) {
-                true => Kind::PullBack,
-                false => Kind::Evaluate { follows: biased, features: true },
+                true => TicketKind::PullBack,
+                false => TicketKind::Evaluate { follows: biased, features: true },
             };
             let shape = Shape { structures: 1, atoms: 4, bonds: 10 };
             let (id, since) = (self.next_id, self.now);
@@ -443,8 +448,8 @@ mod tests {
                     for ticket in batch.tickets() {
                         assert!(self.open.remove(&(ticket.id, ticket.client)), "answered twice: {ticket:?}");
                         match ticket.kind {
-                            Kind::PullBack => self.evaluated.remove(&ticket.client),
-                            Kind::Evaluate { .. } => self.evaluated.insert(ticket.client, ticket.id),
+                            TicketKind::PullBack => self.evaluated.remove(&ticket.client),
+                            TicketKind::Evaluate { .. } => self.evaluated.insert(ticket.client, ticket.id),
                         };
                     }
                 }
@@ -463,19 +468,20 @@ mod tests {
         }
 
         fn send(&mut self) {
-            while let Next::Send(batch) = self.schedule.next(self.now) {
+            while let NextBatch::Send(batch) = self.schedule.next(self.now) {
                 let tickets = batch.tickets();
                 assert!(!tickets.is_empty() && tickets.len() <= MOST, "{batch:?}");
                 assert!(
-                    tickets.len() == 1 || tickets.iter().all(|one| !one.alone || one.kind == Kind::PullBack)
+                    tickets.len() == 1
+                        || tickets.iter().all(|one| !one.alone || one.kind == TicketKind::PullBack)
                 );
                 let is_pull_back = !matches!(batch, DeviceBatch::Evaluate { .. });
                 for ticket in &tickets {
-                    assert_eq!(ticket.kind == Kind::PullBack, is_pull_back, "{batch:?}");
+                    assert_eq!(ticket.kind == TicketKind::PullBack, is_pull_back, "{batch:?}");
                 }
                 self.check_places(&batch);
                 self.sent.push_back(batch);
-                assert!(self.sent.len() <= AHEAD);
+                assert!(self.sent.len() <= MAX_IN_FLIGHT);
             }
         }
     }
@@ -580,14 +586,27 @@ mod tests {
             let mut schedule = Schedule::new(8, padding);
             schedule.limit_bonds(50);
             let shape = Shape { structures: 1, atoms: 4, bonds: 10 };
-            let kind = Kind::Evaluate { follows: true, features: true };
+            let kind = TicketKind::Evaluate { follows: true, features: true };
             let now = Instant::now();
             (1..9).for_each(|id| {
                 schedule.add(Ticket { id, client: id, kind, shape, since: now, alone: false })
             });
-            let Next::Send(batch) = schedule.next(now) else { panic!("nothing is sent") };
+            let NextBatch::Send(batch) = schedule.next(now) else { panic!("nothing is sent") };
             assert_eq!(batch.tickets().len(), most);
         }
+    }
+
+    /// An evaluation that is made again, because its result was nonsense, is the one that is pulled back.
+    #[test]
+    fn what_is_evaluated_again_is_forgotten_first() {
+        let mut simulation = Simulation::new();
+        simulation.step(Step::Call(1, true));
+        let ticket = simulation.sent[0].tickets()[0];
+        simulation.schedule.done(simulation.now, Duration::from_secs(1));
+        simulation.schedule.put_back(vec![Ticket { alone: true, ..ticket }]);
+        simulation.sent.clear();
+        simulation.send();
+        assert!(matches!(simulation.sent[0], DeviceBatch::Evaluate { slot: 0, .. }), "{:?}", simulation.sent);
     }
 
     /// An idle device waits for pull-backs for half of the time that the evaluation took.
@@ -598,9 +617,9 @@ mod tests {
         let now = simulation.now;
         simulation.schedule.done(now, Duration::from_millis(80));
         let until = now + Duration::from_millis(40);
-        assert_eq!(simulation.schedule.next(now), Next::WaitUntil(until));
-        assert_eq!(simulation.schedule.next(until), Next::Wait, "it is given up");
-        simulation.schedule.add(Ticket { kind: Kind::PullBack, ..simulation.sent[0].tickets()[0] });
-        assert!(matches!(simulation.schedule.next(until), Next::Send(DeviceBatch::PullBackAnew { .. })));
+        assert_eq!(simulation.schedule.next(now), NextBatch::WaitUntil(until));
+        assert_eq!(simulation.schedule.next(until), NextBatch::Wait, "it is given up");
+        simulation.schedule.add(Ticket { kind: TicketKind::PullBack, ..simulation.sent[0].tickets()[0] });
+        assert!(matches!(simulation.schedule.next(until), NextBatch::Send(DeviceBatch::PullBackAnew { .. })));
     }
 }

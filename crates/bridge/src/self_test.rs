@@ -339,7 +339,7 @@ fn geometry(
     let index =
         |species: &Species| subject.elements.iter().position(|known| known == species).unwrap_or_default();
     let species: Vec<usize> = structure.species.iter().map(index).collect();
-    Ok(BondGeometry::of(structure, Topology::of(&species, &list, None)))
+    Ok(BondGeometry::from_structure(structure, Topology::from_list(&species, &list, None)))
 }
 
 /// Eight atoms on a distorted cubic lattice, of all elements in turn.

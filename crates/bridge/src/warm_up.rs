@@ -6,16 +6,16 @@ use tracing::info;
 use crate::call::BondGeometry;
 use crate::description::AdapterFeatures;
 use crate::events::DeviceEvent;
-use crate::faults::Fault;
-use crate::running::Running;
+use crate::faults::ServerFault;
 use crate::schedule::SLOTS;
 use crate::self_test::{TestResult, random_numbers};
 use crate::server::Synchronous;
+use crate::server_loop::ServerLoop;
 
 /// The numbers of a structure in a batch: of its evaluation, and of its pull-back if the model has features.
 type Copied = [Option<TestResult>; 2];
 
-impl Running<'_> {
+impl ServerLoop<'_> {
     /// Evaluates batches of one, two, four … copies, at most `most`, and finds how many fit into the memory. Returns whether each copy
     /// has the bits of the structure alone.
     pub fn warm_up(&mut self, geometry: &BondGeometry, most: usize) -> bool {
@@ -35,12 +35,12 @@ impl Running<'_> {
                     are_same &= results.iter().all(|one| one == first);
                     copies *= 2;
                 }
-                Err(short @ (Fault::Memory(_) | Fault::Arena(_))) if copies > 1 => {
+                Err(short @ (ServerFault::Memory(_) | ServerFault::Arena(_))) if copies > 1 => {
                     info!(
                         message = short.message(),
                         copies, "the memory of the device takes fewer structures"
                     );
-                    self.limit_bonds(bonds * copies / 2, matches!(short, Fault::Memory(_)));
+                    self.limit_bonds(bonds * copies / 2, matches!(short, ServerFault::Memory(_)));
                     break;
                 }
                 Err(fault) => {
@@ -62,8 +62,8 @@ impl Running<'_> {
         geometry: &BondGeometry,
         copies: usize,
         early: &mut Vec<DeviceEvent>,
-    ) -> Result<Vec<Copied>, Fault> {
-        let Some(server) = self.server.as_mut() else { return Err(Fault::Stopped) };
+    ) -> Result<Vec<Copied>, ServerFault> {
+        let Some(server) = self.server.as_mut() else { return Err(ServerFault::Stopped) };
         let has_features = server.description.features.form != AdapterFeatures::None;
         let dimension = if has_features { server.description.features.dimension } else { 0 };
         let cotangent = random_numbers(geometry.positions.len() * dimension, 5);

@@ -9,12 +9,12 @@ use tracing::info;
 use crate::batch_limit::LimitFile;
 use crate::description::{AdapterFeatures, ModelDescription};
 use crate::error::DeviceError;
-use crate::faults::Fault;
-use crate::running::{REFERENCE, Running};
+use crate::faults::ServerFault;
 use crate::same_model::ModelReference;
 use crate::schedule::Schedule;
 use crate::self_test::{self, SelfTestReport, TestSubject};
 use crate::server::{Server, Synchronous};
+use crate::server_loop::{REFERENCE, ServerLoop};
 use crate::setup::DeviceSetup;
 
 /// What a device tells of itself when it is ready.
@@ -52,7 +52,7 @@ pub(crate) fn run(
 fn begin<'a>(
     setup: &'a DeviceSetup,
     progress: &'a dyn Fn(&str),
-) -> Result<(Running<'a>, DeviceInfo), DeviceError> {
+) -> Result<(ServerLoop<'a>, DeviceInfo), DeviceError> {
     // No walker knows the device before it has started.
     let early = &mut Vec::new();
     progress(&format!("starting {}", setup.settings.names()));
@@ -85,7 +85,7 @@ fn begin<'a>(
     let limit = description.max_structures.unwrap_or(u32::MAX).min(setup.settings.max_batch.get());
     let limit_file = LimitFile::new(&setup.settings, &description);
     let reference = ModelReference { description, energies };
-    let mut running = Running {
+    let mut running = ServerLoop {
         setup,
         progress,
         server: Some(server),
@@ -110,9 +110,9 @@ fn begin<'a>(
     Ok((running, DeviceInfo { reference, self_test: report }))
 }
 
-fn start_error(fault: Fault) -> DeviceError {
+fn start_error(fault: ServerFault) -> DeviceError {
     match fault {
-        Fault::Stopped => DeviceError::Stopped,
+        ServerFault::Stopped => DeviceError::Stopped,
         other => DeviceError::Server(other.message().to_owned()),
     }
 }

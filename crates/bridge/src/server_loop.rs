@@ -10,11 +10,11 @@ use crate::batch_limit::LimitFile;
 use crate::call::{BondGeometry, Call};
 use crate::error::CallError;
 use crate::events::DeviceEvent;
-use crate::faults::Fault;
+use crate::faults::ServerFault;
 use crate::process::ServerEvent;
 use crate::recipient::Recipient;
 use crate::same_model::ModelReference;
-use crate::schedule::{DeviceBatch, Kind, Next, Schedule, Ticket};
+use crate::schedule::{DeviceBatch, NextBatch, Schedule, Ticket, TicketKind};
 use crate::server::{Outstanding, Server};
 use crate::setup::DeviceSetup;
 
@@ -26,12 +26,12 @@ const IDLE: Duration = Duration::from_secs(3600);
 /// A call without result.
 pub(crate) struct PendingCall {
     pub client: u64,
-    pub work: Work,
+    pub work: CallKind,
     pub recipient: Recipient,
 }
 
 /// What a call asks for.
-pub(crate) enum Work {
+pub(crate) enum CallKind {
     Evaluate { geometry: BondGeometry, features: bool },
     PullBack { cotangent: Vec<f64> },
 }
@@ -43,13 +43,13 @@ pub(crate) struct SentBatch {
 }
 
 /// A result that is nonsense, until the reference structure tells whether that is the server's fault.
-pub(crate) struct Suspect {
+pub(crate) struct SuspectResult {
     pub ticket: Ticket,
     pub outcome: Result<Vec<f64>, String>,
 }
 
 /// The thread while its server runs.
-pub(crate) struct Running<'a> {
+pub(crate) struct ServerLoop<'a> {
     pub setup: &'a DeviceSetup,
     pub progress: &'a dyn Fn(&str),
     pub server: Option<Server>,
@@ -64,7 +64,7 @@ pub(crate) struct Running<'a> {
     pub clients: HashMap<u64, BondGeometry>,
     pub calls: HashMap<u64, PendingCall>,
     pub sent: VecDeque<SentBatch>,
-    pub suspects: Vec<Suspect>,
+    pub suspects: Vec<SuspectResult>,
     /// How often the server has failed at each call that has no result yet.
     pub crashes: HashMap<u64, u32>,
     /// Failures of the server since its last answer to a client.
@@ -77,7 +77,7 @@ pub(crate) struct Running<'a> {
     pub given_up: Option<String>,
 }
 
-impl Running<'_> {
+impl ServerLoop<'_> {
     /// Works until the device is closed.
     pub fn run(&mut self) {
         loop {
@@ -111,7 +111,7 @@ impl Running<'_> {
                     ServerEvent::Ended => {
                         let names = self.setup.settings.names();
                         let batch = self.take_oldest();
-                        self.restart(Fault::Exited(format!("{names}: the server has exited")), batch);
+                        self.restart(ServerFault::Exited(format!("{names}: the server has exited")), batch);
                     }
                 }
             }
@@ -130,11 +130,11 @@ impl Running<'_> {
         let known = self.clients.get(&client).map(BondGeometry::shape);
         let accepted = call.and_then(|call| match call {
             Call::Evaluate { geometry, features, pull_back_follows } => {
-                let kind = Kind::Evaluate { follows: pull_back_follows, features };
-                Ok((geometry.shape(), kind, Work::Evaluate { geometry, features }))
+                let kind = TicketKind::Evaluate { follows: pull_back_follows, features };
+                Ok((geometry.shape(), kind, CallKind::Evaluate { geometry, features }))
             }
             Call::PullBack { cotangent } => match known {
-                Some(shape) => Ok((shape, Kind::PullBack, Work::PullBack { cotangent })),
+                Some(shape) => Ok((shape, TicketKind::PullBack, CallKind::PullBack { cotangent })),
                 None => Err("a pull-back before the first evaluation".to_owned()),
             },
         });
@@ -153,9 +153,9 @@ impl Running<'_> {
     fn dispatch(&mut self) -> Option<Instant> {
         while self.server.is_some() {
             match self.schedule.next(Instant::now()) {
-                Next::Send(batch) => self.send(batch),
-                Next::WaitUntil(time) => return Some(time),
-                Next::Wait => return None,
+                NextBatch::Send(batch) => self.send(batch),
+                NextBatch::WaitUntil(time) => return Some(time),
+                NextBatch::Wait => return None,
             }
         }
         None
@@ -171,7 +171,7 @@ impl Running<'_> {
                 self.setup.note(|statistics| statistics.waited += waited);
             }
             // It exited when it was idle, or while it computed the batch before.
-            Err(fault @ Fault::Exited(_)) => {
+            Err(fault @ ServerFault::Exited(_)) => {
                 self.schedule.abort_newest();
                 self.schedule.put_back(batch.tickets());
                 let before = self.take_oldest();
@@ -189,22 +189,22 @@ impl Running<'_> {
         self.sent.pop_front().map(|sent| sent.batch.tickets()).unwrap_or_default()
     }
 
-    fn write_and_send(&mut self, batch: &DeviceBatch) -> Result<Outstanding, Fault> {
+    fn write_and_send(&mut self, batch: &DeviceBatch) -> Result<Outstanding, ServerFault> {
         let Self { server, calls, clients, test_structure, setup, .. } = self;
-        let server = server.as_mut().ok_or(Fault::Stopped)?;
+        let server = server.as_mut().ok_or(ServerFault::Stopped)?;
         let settings = &setup.settings;
         let geometry = |ticket: &Ticket| match calls.get(&ticket.id).map(|call| &call.work) {
-            Some(Work::Evaluate { geometry, .. }) => geometry,
+            Some(CallKind::Evaluate { geometry, .. }) => geometry,
             _ => clients.get(&ticket.client).unwrap_or(test_structure),
         };
         let cotangent = |ticket: &Ticket| match calls.get(&ticket.id).map(|call| &call.work) {
-            Some(Work::PullBack { cotangent }) => Some(&cotangent[..]),
+            Some(CallKind::PullBack { cotangent }) => Some(&cotangent[..]),
             _ => None,
         };
         match batch {
             DeviceBatch::Evaluate { slot, tickets } => {
                 server.write(*slot, &tickets.iter().map(geometry).collect::<Vec<_>>())?;
-                let wants = |one: &Ticket| matches!(one.kind, Kind::Evaluate { features: true, .. });
+                let wants = |one: &Ticket| matches!(one.kind, TicketKind::Evaluate { features: true, .. });
                 server.send(*slot, Some(tickets.iter().any(wants)), settings)
             }
             DeviceBatch::PullBackKept { slot, tickets } => {
@@ -223,7 +223,7 @@ impl Running<'_> {
     fn take_answer(&mut self, line: &str) {
         let names = self.setup.settings.names();
         let Some(SentBatch { call, batch }) = self.sent.pop_front() else {
-            let fault = Fault::Nonsense(format!("{names}: an answer without a call"));
+            let fault = ServerFault::Nonsense(format!("{names}: an answer without a call"));
             return self.restart(fault, Vec::new());
         };
         let now = Instant::now();
@@ -259,10 +259,10 @@ impl Running<'_> {
             let mut parts = server.arenas[call.slot].result(place, call.kind);
             if ticket.id == REFERENCE {
                 let energies = parts.energies.to_vec();
-                self.judge(&energies);
+                self.check_reference(&energies);
                 continue;
             }
-            if let Some(Work::Evaluate { features: false, .. }) =
+            if let Some(CallKind::Evaluate { features: false, .. }) =
                 self.calls.get(&ticket.id).map(|call| &call.work)
             {
                 parts.features = &[];
@@ -278,7 +278,7 @@ impl Running<'_> {
             (self.failures, self.refusals) = (0, 0);
             if let Some(call) = self.calls.remove(&ticket.id) {
                 call.recipient.answer(parts.len(), |out| parts.write(out));
-                if let Work::Evaluate { geometry, .. } = call.work {
+                if let CallKind::Evaluate { geometry, .. } = call.work {
                     self.clients.insert(call.client, geometry);
                 }
             }
@@ -291,7 +291,7 @@ impl Running<'_> {
             let seconds = sent.call.timeout.as_secs();
             let names = self.setup.settings.names();
             let batch = self.take_oldest();
-            self.restart(Fault::Timeout(format!("{names}: no answer for {seconds} s")), batch);
+            self.restart(ServerFault::Timeout(format!("{names}: no answer for {seconds} s")), batch);
         }
     }
 
