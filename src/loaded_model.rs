@@ -54,7 +54,11 @@ impl LoadedModel {
         Ok(model.map_err(CommandError::input)?.into())
     }
 
-    fn from_configuration(path: &Path) -> Result<Self, CommandError> {
+    /// Loads the model of the section `[potential]` of a file, whatever its name.
+    ///
+    /// # Errors
+    /// As [`LoadedModel::load`].
+    pub fn from_configuration(path: &Path) -> Result<Self, CommandError> {
         let potential = Config::load_potential(path).map_err(CommandError::input)?;
         let model = potential.model.get_ref();
         let Some(python) = &potential.python else { return Self::load_export(model, potential.precision) };

@@ -12,10 +12,13 @@ use crate::exit_status::CommandError;
 use crate::output::log_and_print;
 
 /// A reason of [`irreproducible`].
+const DEPENDS_ON_BATCH: &str = "the bits of a structure depend on those beside it in a batch";
+
+/// A reason of [`irreproducible`].
 pub const NOT_DETERMINISTIC: &str = "the model gives other bits when a call is repeated";
 
 /// Starts the program of a model on each device, which ends with the last who uses it. Cancelling `stop` ends the start, and later
-/// restarts. With `same_bits`, all devices must give the same bits.
+/// restarts. With `same_bits`, all devices must give the same bits, also after a restart.
 ///
 /// # Errors
 /// A program that does not start, a model whose derivatives are wrong, or one that is another on another device.
@@ -28,7 +31,7 @@ pub fn start(
     let start_one = |settings: PythonSettings| {
         let label = if is_alone { "python".to_owned() } else { format!("python, {}", settings.device) };
         let progress = move |text: &str| log_and_print(format_args!("{label}: {text}"));
-        Device::start(settings, stop, progress).map(Arc::new)
+        Device::start(settings, same_bits, stop, progress).map(Arc::new)
     };
     let devices: Vec<Arc<Device>> = thread::scope(|scope| {
         let starting: Vec<_> =
@@ -60,25 +63,28 @@ pub fn irreproducible(devices: &[Arc<Device>], max_batch: u32) -> Option<&'stati
     if !all(|test| test.is_deterministic) {
         Some(NOT_DETERMINISTIC)
     } else if !all(|test| test.is_batch_independent) && max_batch > 1 {
-        Some("the bits of a structure depend on those beside it in a batch")
+        Some(DEPENDS_ON_BATCH)
     } else {
         None
     }
 }
 
-/// Prepares devices for the calls of this many walkers with structures up to this size, if that is of use.
+/// Prepares devices for the calls of this many walkers with structures up to this size, if that is of use. With `same_bits`, the bits of a
+/// structure must not depend on the size of the batch: kernels may be chosen by the size of matrices, which the self-test's small ones do
+/// not show.
 ///
 /// # Errors
-/// A crashed thread, or a structure that the model does not support.
+/// A crashed thread, a structure that the model does not support, or bits that depend on the size of the batch.
 pub async fn warm_up(
     devices: &[Arc<Device>],
     largest: &Structure,
     skin: f64,
     walkers: u32,
+    same_bits: bool,
 ) -> Result<(), CommandError> {
     let is_of_use = |device: &&Arc<Device>| {
         let description = device.info().description();
-        description.device != "cpu" || description.padding
+        same_bits || description.device != "cpu" || description.padding
     };
     let most = (walkers as usize).div_ceil(devices.len().max(1));
     let prepare = |device: &Arc<Device>| {
@@ -87,7 +93,13 @@ pub async fn warm_up(
     };
     let works: Vec<_> = devices.iter().filter(is_of_use).map(prepare).collect();
     for work in works {
-        work.await.map_err(CommandError::failed)?.map_err(CommandError::Failed)?;
+        let is_independent = work.await.map_err(CommandError::failed)?.map_err(CommandError::Failed)?;
+        if same_bits && !is_independent {
+            return Err(CommandError::Input(format!(
+                "the campaign is reproducible, but {DEPENDS_ON_BATCH} of the largest seed structure: set potential.python.max_batch = 1, or \
+                 campaign.mode = \"live\""
+            )));
+        }
     }
     Ok(())
 }

@@ -53,8 +53,6 @@ class ModelInfo:
     """Whether the adapter builds its own neighbour list from positions and cells, and so cannot use bonds."""
     max_structures: Optional[int] = None
     """Largest batch, if the model has a limit of its own."""
-    energy_only: bool = False
-    """Whether the model has no forces."""
     versions: Mapping[str, str] = field(default_factory=dict)
     """Versions of the framework and the model's package."""
     projection: Optional[Mapping[str, Any]] = None

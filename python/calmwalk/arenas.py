@@ -50,6 +50,9 @@ class Arena:
     path: str
     bytes: int
     map: mmap.mmap
+    layout: Any = None
+    """Shape and offsets of `views`."""
+    views: dict[str, np.ndarray] = field(default_factory=dict)
     shape: Optional[tuple[int, ...]] = None
     topology: Optional[int] = None
     fixed: dict[str, Any] = field(default_factory=dict)
@@ -80,10 +83,12 @@ class Arenas:
         arena = self._arena(message)
         shape = _shape(message, dimension)
         offsets = get(message, "sections", dict)
-        arrays = {
-            name: _view(arena, name, offsets, shape, spec)
-            for name, spec in [*_INPUTS.items(), *((name, _OTHERS[name]) for name in sections)]
-        }
+        if arena.layout != (shape, offsets):
+            arena.layout, arena.views = (shape, offsets), {}
+        for name, spec in [*_INPUTS.items(), *((name, _OTHERS[name]) for name in sections)]:
+            if name not in arena.views:
+                arena.views[name] = _view(arena, name, offsets, shape, spec)
+        arrays = {name: arena.views[name] for name in [*_INPUTS, *sections]}
         _keep_while_topology_stays(arena, get(message, "topology", int), tuple(shape.values()))
         inputs = {name: arrays.pop(name) for name in _INPUTS}
         batch = Batch(**inputs, real=_real(message, shape), fixed=arena.fixed)

@@ -43,23 +43,22 @@ class Server:
         self._adapter: Optional[Adapter] = None
         self._arenas: Optional[Arenas] = None
 
-    def answer(self, line: bytes) -> tuple[dict[str, Any], bool]:
-        """The answer to one line, and whether the server continues after it. Never raises."""
+    def answer(self, line: bytes) -> dict[str, Any]:
+        """The answer to one line. Never raises."""
         message: dict[str, Any] = {}
         try:
             message = protocol.parse(line)
-            return self._call(message), message["call"] != "shutdown"
+            return self._call(message)
         except BaseException as error:
             if isinstance(error, (KeyboardInterrupt, GeneratorExit)):
                 raise
-            return self._failure(message, error), True
+            return self._failure(message, error)
 
     def _call(self, message: Mapping[str, Any]) -> dict[str, Any]:
         calls: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
             "hello": self._hello,
             "evaluate": self._evaluate,
             "pull_back": self._pull_back,
-            "shutdown": lambda _: {"status": "ok"},
         }
         if message["call"] not in calls:
             raise InputError(f"the call is '{message['call']}', expected one of {', '.join(calls)}")
@@ -92,7 +91,6 @@ class Server:
         return answer
 
     def _evaluate(self, message: Mapping[str, Any]) -> dict[str, Any]:
-        started = time.perf_counter()
         adapter, info = self._ready()
         features = bool(message.get("features"))
         names = ["energies", "forces", "virials"] + (["features"] if features else [])
@@ -100,21 +98,24 @@ class Server:
         call.arena.evaluated = call.arena.kept = None
         if features and info.features.form == "none":
             raise InputError("features are asked for, but the model has none")
+        started = time.perf_counter()
         result = adapter.evaluate(call.batch, features)
+        seconds = time.perf_counter() - started
         self._write("evaluate", call, {name: getattr(result, name) for name in names})
         call.arena.evaluated, call.arena.kept = call.id, call.batch.kept
-        return _done(call.id, started, result.compiled)
+        return _done(call.id, seconds, result.compiled)
 
     def _pull_back(self, message: Mapping[str, Any]) -> dict[str, Any]:
-        started = time.perf_counter()
         adapter, _ = self._ready()
         energy = ["energy_cotangents"] if message.get("energy") else []
         call = self._read(message, ["feature_cotangents", *energy, "gradients", "gradient_virials"])
         if message.get("kept") is not None and message["kept"] == call.arena.evaluated:
             call.batch.kept = call.arena.kept
+        started = time.perf_counter()
         result = adapter.pull_back(call.batch, call.arrays["feature_cotangents"], call.arrays.get("energy_cotangents"))
+        seconds = time.perf_counter() - started
         self._write("pull_back", call, {"gradients": result.gradients, "gradient_virials": result.virials})
-        return _done(call.id, started, result.compiled)
+        return _done(call.id, seconds, result.compiled)
 
     def _ready(self) -> tuple[Adapter, ModelInfo]:
         if self._adapter is None:
@@ -170,11 +171,8 @@ def describe(name: str, info: ModelInfo) -> dict[str, Any]:
         },
         "precision": info.precision,
         "padding": info.padding,
-        "needs_positions": info.needs_positions,
         "identity": info.identity,
         "max_structures": info.max_structures,
-        "energy_only": info.energy_only,
-        "projection": None if info.projection is None else dict(info.projection),
     }
 
 
@@ -241,8 +239,8 @@ def take_streams() -> protocol.Connection:
     return protocol.Connection(incoming, outgoing)
 
 
-def _done(call: int, started: float, compiled: bool) -> dict[str, Any]:
-    return {"status": "ok", "id": call, "seconds": time.perf_counter() - started, "compiled": bool(compiled)}
+def _done(call: int, seconds: float, compiled: bool) -> dict[str, Any]:
+    return {"status": "ok", "id": call, "seconds": seconds, "compiled": bool(compiled)}
 
 
 def _end_with_parent() -> None:
@@ -252,7 +250,7 @@ def _end_with_parent() -> None:
 
 
 def main() -> int:
-    """Serves until shutdown or the end of standard input."""
+    """Serves until the end of standard input."""
     # Ctrl-C and batch systems signal all processes; walkers finish their step, for which they need this one.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
@@ -260,13 +258,10 @@ def main() -> int:
     connection = take_streams()
     server = Server()
     for line in connection.lines():
-        answer, goes_on = server.answer(line)
         try:
-            connection.reply(answer)
+            connection.reply(server.answer(line))
         except BrokenPipeError:
             return 1
-        if not goes_on:
-            return 0
     return 0
 
 

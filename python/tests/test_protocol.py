@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calmwalk.adapters.radial import Radial
-from calmwalk.arenas import _INPUTS
+from calmwalk.arenas import _INPUTS, Arenas
 from calmwalk.check import Check
 from calmwalk.neighbours import Structure, batch_of
 
@@ -37,7 +37,7 @@ class RoundTrip(unittest.TestCase):
         self.assertEqual(hello["cutoffs"], [[5.5, 5.5], [5.5, 5.5]])
         self.assertEqual(hello["features"], {"form": "raw", "dimension": 14, "blocks": [8, 6]})
         self.assertRegex(hello["identity"], "^[0-9a-f]{64}$")
-        self.assertEqual([hello["padding"], hello["needs_positions"], hello["energy_only"]], [False, False, False])
+        self.assertIs(hello["padding"], False)
         self.assertLessEqual({"python", "numpy"}, set(hello["versions"]))
 
     def test_results_are_those_of_the_adapter(self) -> None:
@@ -85,12 +85,33 @@ class RoundTrip(unittest.TestCase):
         self.assertEqual(self.client.receive()["status"], "ok")
         np.testing.assert_array_equal(self.client.results()["energies"], [0.0])
 
-    def test_shutdown_and_end_of_input_end_the_server(self) -> None:
-        self.assertEqual(self.client.ask({"call": "shutdown"}), {"status": "ok"})
-        self.assertEqual(self.client.process.wait(10), 0)
+    def test_the_end_of_input_ends_the_server(self) -> None:
         with Client() as other:
             other.process.stdin.close()
             self.assertEqual(other.process.wait(10), 0)
+
+
+class Views(unittest.TestCase):
+    def test_they_are_made_once_for_a_layout(self) -> None:
+        with tempfile.NamedTemporaryFile() as file:
+            file.truncate(1 << 16)
+            sizes = {"structures": 1, "atoms": 2, "bonds": 2}
+            message = {"id": 1, "arena": 0, "path": file.name, "bytes": 1 << 16, **sizes, "real": sizes, "topology": 1}
+            arenas = Arenas()
+
+            def read(first: int, **more: Any) -> np.ndarray:
+                names = [*_INPUTS, "energies", "forces"]
+                offsets = {name: first + 256 * number for number, name in enumerate(names)}
+                call = {**message, "sections": offsets, **more}
+                arenas.read(call, 0, ["forces"])
+                return arenas.read(call, 0, ["energies"]).arrays["energies"]
+
+            energies = read(0)
+            self.assertIs(read(0), energies)
+            energies[:] = 7.0
+            np.testing.assert_array_equal(read(64), [0.0, 0.0])
+            np.testing.assert_array_equal(read(0), [7.0, 7.0])
+            self.assertEqual(read(0, atoms=3).shape, (3,))
 
 
 class Errors(unittest.TestCase):

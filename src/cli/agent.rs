@@ -47,6 +47,13 @@ pub struct AgentArgs {
     /// Python environment on this host [default: potential.python.environment of the configuration]
     #[arg(long, value_name = "DIR")]
     python_environment: Option<PathBuf>,
+    /// Words before the Python program on this host, such as those of a container; repeat for each word. --python-environment is then
+    /// the program inside [default: potential.python.launcher of the configuration]
+    #[arg(long = "python-launcher", value_name = "WORD", allow_hyphen_values = true)]
+    python_launcher: Vec<String>,
+    /// Directory in which frameworks keep compiled programs on this host [default: potential.python.cache of the configuration]
+    #[arg(long, value_name = "DIR")]
+    python_cache: Option<PathBuf>,
     /// Device of this host that evaluates a model in Python, such as cuda:1; may be repeated [default: potential.python.device of the
     /// configuration]
     #[arg(long = "device", value_name = "NAME")]
@@ -87,9 +94,12 @@ impl AgentArgs {
             walkers,
             prefetch: self.prefetch,
         };
-        let absolute = |path: &PathBuf| std::path::absolute(path).map_err(CommandError::input);
-        let environment = self.python_environment.as_ref().map(absolute).transpose()?;
-        let python = HostPython { environment, devices: self.devices };
+        let python = HostPython {
+            environment: self.python_environment,
+            launcher: self.python_launcher,
+            cache: self.python_cache,
+            devices: self.devices,
+        };
         let watched = AgentState::default();
         block_on(async {
             if let Some(address) = self.metrics {

@@ -22,6 +22,7 @@ pub struct CleanArgs {
 impl CleanArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         if self.directories.is_empty() {
+            bridge::remove_abandoned();
             for shared in ShmDir::all().map_err(CommandError::failed)? {
                 let campaign = shared.campaign_directory();
                 match clean(&shared, campaign) {

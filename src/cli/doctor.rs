@@ -76,8 +76,8 @@ impl DoctorArgs {
             None => checks
                 .extend(directory::checks(&self.campaign_directory(), needs.and_then(Requirements::disk))),
         }
-        let python = self.python.clone().or_else(|| needs.and_then(Requirements::python));
-        checks.extend(python::checks(python.as_deref()));
+        let named = self.python.as_deref().map(|environment| (&[][..], environment));
+        checks.extend(python::checks(named.or_else(|| needs.and_then(Requirements::python))));
         checks.push(programs::device());
         checks.extend(programs::codes());
         let slurm = needs.is_some_and(Requirements::slurm);

@@ -56,6 +56,12 @@ impl<'a> Document<'a> {
         }
     }
 
+    /// Whether a table of the file has a key.
+    pub fn has(&self, table: &str, key: &str) -> bool {
+        let table = self.table.get_ref().get(table).and_then(|value| value.get_ref().as_table());
+        table.is_some_and(|table| table.contains_key(key))
+    }
+
     /// Deserializes the file and collects all errors. Required entries that are missing or invalid get their values from
     /// `placeholders`, the text of a valid file. Returns `None` if nothing can be deserialized.
     pub fn read<T: DeserializeOwned>(&mut self, placeholders: &str, known: &KnownKeys) -> Option<T> {

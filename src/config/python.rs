@@ -19,7 +19,8 @@ use crate::duration::Duration;
 pub struct PythonSection {
     /// Directory of the virtual or conda environment with the model's framework, or a Python program.
     pub environment: PathBuf,
-    /// Words before the Python program, for instance `["apptainer", "exec", "mace.sif"]`; `environment` is then the program inside. Default: none.
+    /// Words before the Python program, for instance `["apptainer", "exec", "mace.sif"]`; `environment` is then the program inside. Relative
+    /// paths in it are relative to the working directory of calmwalk. Default: none.
     #[serde(default)]
     pub launcher: Vec<String>,
     /// Adapter that evaluates the model: `gracemaker`, `mace`, `ase`, or your own as `file.py:Class` or `module:Class`.
@@ -58,7 +59,11 @@ impl PythonSection {
             None => self.adapter.clone(),
         };
         let of_device = |device: &String| PythonSettings {
-            environment: absolute(&self.environment),
+            environment: if self.launcher.is_empty() {
+                absolute(&self.environment)
+            } else {
+                self.environment.clone()
+            },
             launcher: self.launcher.clone(),
             adapter: adapter.clone(),
             model: Some(absolute(model)),
@@ -81,7 +86,10 @@ impl PythonSection {
 
     /// Resolves paths relative to the directory of the configuration.
     pub(super) fn resolve_paths(&mut self, directory: &Path) {
-        self.environment = directory.join(&self.environment);
+        // Behind a launcher, it is the program inside.
+        if self.launcher.is_empty() {
+            self.environment = directory.join(&self.environment);
+        }
         if let Some(cache) = &mut self.cache {
             *cache = directory.join(&*cache);
         }
@@ -163,6 +171,19 @@ mod tests {
         assert_eq!(timeout(""), 120);
         assert_eq!(timeout(&format!("{python}\ncompile_timeout = \"5m\"\ntimeout = \"20s\"")), 320);
         assert_eq!(timeout(&format!("{python}\ncompile_timeout = \"30s\"\ntimeout = \"20s\"")), 120);
+    }
+
+    #[test]
+    fn a_program_behind_a_launcher_is_no_path() {
+        let environment = |launcher: &str| {
+            let text = format!("environment = \"python3\"\nadapter = \"mace\"\n{launcher}");
+            let mut section: PythonSection = toml::from_str(&text).unwrap();
+            section.resolve_paths(Path::new("/campaign"));
+            let settings = section.settings(Path::new("model"), Precision::default());
+            settings[0].environment.display().to_string()
+        };
+        assert_eq!(environment(""), "/campaign/python3");
+        assert_eq!(environment("launcher = [\"apptainer\", \"exec\", \"mace.sif\"]"), "python3");
     }
 
     #[test]

@@ -20,8 +20,47 @@ use crate::python_model;
 pub struct HostPython {
     /// Environment of the model's framework.
     pub environment: Option<PathBuf>,
+    /// Words before the Python program. Empty: those of the configuration.
+    pub launcher: Vec<String>,
+    /// Directory in which frameworks keep compiled programs.
+    pub cache: Option<PathBuf>,
     /// Devices that evaluate the model. Empty: those of the configuration.
     pub devices: Vec<String>,
+}
+
+impl HostPython {
+    /// Whether anything is another one.
+    fn is_given(&self) -> bool {
+        let Self { environment, launcher, cache, devices } = self;
+        environment.is_some() || !launcher.is_empty() || cache.is_some() || !devices.is_empty()
+    }
+
+    /// How the program of each device is started on this host.
+    fn settings(&self, of_campaign: &[PythonSettings]) -> Vec<PythonSettings> {
+        let on = |device: &String| {
+            let first = of_campaign.first().cloned();
+            first.map(|settings| PythonSettings { device: device.clone(), ..settings })
+        };
+        let mut settings = match self.devices.as_slice() {
+            [] => of_campaign.to_vec(),
+            devices => devices.iter().filter_map(on).collect(),
+        };
+        let absolute = |path: &PathBuf| std::path::absolute(path).unwrap_or_else(|_| path.clone());
+        for one in &mut settings {
+            if !self.launcher.is_empty() {
+                one.launcher.clone_from(&self.launcher);
+            }
+            if let Some(environment) = &self.environment {
+                // Behind a launcher, it is the program inside.
+                let is_inside = !one.launcher.is_empty();
+                one.environment = if is_inside { environment.clone() } else { absolute(environment) };
+            }
+            if let Some(cache) = &self.cache {
+                one.cache = Some(absolute(cache));
+            }
+        }
+        settings
+    }
 }
 
 /// Downloads the files of the model that are not on this host. `None` if this agent lost its membership meanwhile.
@@ -105,22 +144,6 @@ impl AgentPythonModel {
         }
     }
 
-    /// How the program of each device is started on this host.
-    fn settings_here(&self, here: &HostPython) -> Vec<PythonSettings> {
-        let on = |device: &String| {
-            let first = self.settings.first().cloned();
-            first.map(|settings| PythonSettings { device: device.clone(), ..settings })
-        };
-        let mut settings = match here.devices.as_slice() {
-            [] => self.settings.clone(),
-            devices => devices.iter().filter_map(on).collect(),
-        };
-        if let Some(environment) = &here.environment {
-            settings.iter_mut().for_each(|one| one.environment.clone_from(environment));
-        }
-        settings
-    }
-
     /// Checks that the model of the devices of this host is the orchestrator's.
     fn check(&self, devices: &[Arc<Device>], settings: &PythonSettings) -> Result<(), CommandError> {
         let names = settings.names();
@@ -153,11 +176,11 @@ pub async fn start_devices(
     stop: &CancellationToken,
 ) -> Result<Vec<Arc<Device>>, CommandError> {
     let AgentModel::Python(python) = model else {
-        let given = here.environment.is_some() || !here.devices.is_empty();
-        let unused = "--python-environment and --device are for models in Python, but the campaign's is an export of GRACE";
-        return if given { Err(CommandError::input(unused)) } else { Ok(Vec::new()) };
+        let unused = "--python-environment, --python-launcher, --python-cache and --device are for models in Python, but the campaign's is an \
+                      export of GRACE";
+        return if here.is_given() { Err(CommandError::input(unused)) } else { Ok(Vec::new()) };
     };
-    let settings = python.settings_here(here);
+    let settings = here.settings(&python.settings);
     let (starting, same_bits, stopping) = (settings.clone(), python.is_reproducible, stop.clone());
     let devices = spawn_blocking(move || python_model::start(starting, same_bits, &stopping)).await;
     let devices = match devices.map_err(CommandError::failed)? {
@@ -173,7 +196,8 @@ pub async fn start_devices(
         let (adapter, names) = (&device.info().description().adapter, python_model::names(&devices));
         log_and_print(format_args!("python: {adapter} on {names}: the orchestrator's model"));
     }
-    python_model::warm_up(&devices, &python.largest, skin, walkers).await?;
+    let same_bits = python.is_reproducible && settings.iter().any(|one| one.max_batch.get() > 1);
+    python_model::warm_up(&devices, &python.largest, skin, walkers, same_bits).await?;
     Ok(devices)
 }
 
@@ -187,5 +211,32 @@ impl AgentModel {
                 artifact: python.artifact.clone(),
             })),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_host_may_have_its_own_launcher_and_cache() {
+        let mut campaign = PythonSettings::new(Path::new("/env"), "mace", None);
+        campaign.cache = Some("/cache".into());
+        let campaign = [campaign];
+        assert_eq!(HostPython::default().settings(&campaign), campaign);
+        let here = HostPython {
+            environment: Some("python3".into()),
+            launcher: vec!["apptainer".to_owned(), "exec".to_owned()],
+            cache: Some("/scratch/cache".into()),
+            devices: vec!["cuda:1".to_owned()],
+        };
+        let found = &here.settings(&campaign)[0];
+        assert_eq!((found.environment.to_str(), found.device.as_str()), (Some("python3"), "cuda:1"));
+        assert_eq!(
+            (found.launcher.as_slice(), found.cache.as_deref()),
+            (&here.launcher[..], here.cache.as_deref())
+        );
+        let plain = HostPython { launcher: Vec::new(), ..here };
+        assert!(plain.settings(&campaign)[0].environment.is_absolute());
     }
 }

@@ -103,7 +103,9 @@ async fn run_walks(
     let devices = campaign.model.devices();
     if let Some(largest) = campaign.largest_seed_structure() {
         let (skin, walkers) = (campaign.config.walk.skin.get(), wanted_walkers(&campaign.config));
-        python_model::warm_up(devices, largest, skin, walkers).await?;
+        let max_batch = campaign.config.potential.python.as_ref().map_or(1, |python| python.max_batch.get());
+        let same_bits = campaign.config.campaign.mode == CampaignMode::Reproducible && max_batch > 1;
+        python_model::warm_up(devices, largest, skin, walkers, same_bits).await?;
     }
     let order = LabelOrderTask::start(run).await?;
     let completion = order.completion.clone();

@@ -11,8 +11,13 @@ use serde_json::Value;
 
 use crate::common::{Running, config, program, refuse, stderr, succeed};
 
-/// Least number of faults of the server in the campaign that is disturbed.
-const FAULTS: u32 = 20;
+/// Least number of faults of the server in the campaign that is disturbed: 20, or `CALMWALK_FAULTS`.
+fn wanted_faults() -> u32 {
+    std::env::var("CALMWALK_FAULTS").map_or(20, |number| number.parse().unwrap())
+}
+
+/// Biased steps of a walk of the disturbed campaign, enough for 20 faults.
+const STEPS_OF_20_FAULTS: u32 = 400;
 
 /// Calls of the server between two of them.
 const CALLS_BETWEEN: usize = 60;
@@ -85,6 +90,12 @@ fn faults_of_the_server_change_nothing() {
             ),
         ),
     );
+    let wanted = wanted_faults();
+    let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
+    let (usual, steps) =
+        (format!("biased_steps = {STEPS_OF_20_FAULTS}"), STEPS_OF_20_FAULTS * wanted.div_ceil(20));
+    assert!(text.contains(&usual));
+    fs::write(here.join("campaign.toml"), text.replace(&usual, &format!("biased_steps = {steps}"))).unwrap();
     succeed(here, ["run", "campaign.toml", "--directory", "plain", "--in-process"]);
     fs::remove_file(&count).unwrap();
     let mut run =
@@ -100,7 +111,7 @@ fn faults_of_the_server_change_nothing() {
         }
     }
     assert!(run.0.wait().unwrap().success());
-    assert!(faults >= FAULTS, "the campaign was over after {faults} faults");
+    assert!(faults >= wanted, "the campaign was over after {faults} faults");
     let (plain, disturbed) = (export(here, "plain"), export(here, "disturbed"));
     assert!(plain == disturbed, "{} and {} bytes", plain.len(), disturbed.len());
     let status = succeed(here, ["status", "--all", "disturbed"]);
@@ -215,6 +226,7 @@ fn wrong_models_are_refused() {
         (adapter("simulated", "options = { bend = { forces = 1.1 } }"), "the force of a cluster"),
         (adapter("simulated", "options = { noise = 1e-13 }"), "campaign.mode"),
         (adapter("simulated", "options = { crowd = 1e-13 }"), "potential.python.max_batch = 1"),
+        (adapter("simulated", "options = { crowd_gradients = 1e-13 }"), "potential.python.max_batch = 1"),
         (adapter("nothing", ""), "nothing"),
         ("environment = \"/nowhere\"\nadapter = \"radial\"".to_owned(), "/nowhere"),
         (adapter("radial", "max_batch = 0"), "max_batch"),
@@ -228,7 +240,65 @@ fn wrong_models_are_refused() {
     }
 }
 
-/// MACE with random weights: mixture, scores, selection, and a campaign whose labels are those of an ASE calculator.
+/// Bits that differ in large batches only are found before the first walk, with the structures of the campaign.
+#[test]
+fn batches_of_the_campaign_have_the_same_bits() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_campaign(here, &adapter("radial", ""));
+    build(here);
+    let write = |max_batch: u32| {
+        let options = format!("options = {{ crowd = 1e-13, crowd_above = 4 }}\nmax_batch = {max_batch}");
+        write_campaign(here, &adapter("simulated", &options));
+        let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
+        let text =
+            text.replace("walkers = 2", "walkers = 8").replace("biased_steps = 400", "biased_steps = 10");
+        fs::write(here.join("campaign.toml"), text).unwrap();
+    };
+    write(32);
+    let said = refuse(here, ["run", "campaign.toml", "--directory", "c"]);
+    assert!(said.contains("largest seed structure") && said.contains("max_batch = 1"), "{said}");
+    write(4);
+    succeed(here, ["run", "campaign.toml", "--directory", "d"]);
+}
+
+/// `calmwalk md` takes the section `[potential]` of a campaign; energies are those of the adapter.
+#[test]
+fn dynamics_with_an_ase_calculator() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    fs::write(here.join("emt.py"), "from ase.calculators.emt import EMT\n\ncalculator = EMT()\n").unwrap();
+    let seeds = config("data/aluminium_seeds.extxyz").display().to_string();
+    let python = adapter("ase", "options = { elements = [\"Al\"] }");
+    let text = format!(
+        "structure = {seeds:?}\n[potential]\nmodel = \"emt.py\"\n[potential.python]\n{python}\n\
+         [dynamics]\nsteps = 20\ntemperature = 300\ntime_step = 1\nthermostat = {{ none = {{}} }}\n\
+         [output]\ntrajectory = \"out.extxyz\"\nevery = 10\n"
+    );
+    fs::write(here.join("md.toml"), &text).unwrap();
+    succeed(here, ["md", "md.toml"]);
+    let check = "
+import sys
+from ase.calculators.emt import EMT
+from ase.io import read
+
+frames = read('out.extxyz', ':')
+assert len(frames) == 3, len(frames)
+for atoms in frames:
+    energy, forces = atoms.get_potential_energy(), atoms.get_forces()
+    atoms.calc = EMT()
+    assert abs(atoms.get_potential_energy(force_consistent=True) - energy) < 1e-6
+    assert abs(atoms.get_forces() - forces).max() < 1e-6
+";
+    let python = std::env::var("CALMWALK_PYTHON").unwrap();
+    let checked = Command::new(python).args(["-c", check]).current_dir(here).output().unwrap();
+    assert!(checked.status.success(), "{}", stderr(&checked));
+    fs::write(here.join("md.toml"), text.replace("adapter = ", "adaptor = ")).unwrap();
+    let said = refuse(here, ["md", "md.toml"]);
+    assert!(said.contains("adaptor") && said.contains("adapter"), "{said}");
+}
+
+/// MACE with random weights: mixture, its validation, scores, selection, and a campaign whose labels are those of an ASE calculator.
 #[test]
 fn mace_has_a_campaign() {
     let python =
@@ -242,11 +312,22 @@ fn mace_has_a_campaign() {
     for file in ["model.toml", "campaign.toml"] {
         let text = fs::read_to_string(here.join(file)).unwrap();
         let line = text.lines().find(|line| line.starts_with("model = ")).unwrap();
-        let text =
+        let mut text =
             text.replace(line, "model = \"mace.model\"").replace("biased_steps = 400", "biased_steps = 60");
+        if let Some(line) = text.lines().find(|line| line.starts_with("method = ")).map(str::to_owned) {
+            let ase = format!("method = {{ ase = {{ command = [{python:?}], calculator = \"emt.py\" }} }}");
+            text = text.replace(&line, &ase);
+        }
         fs::write(here.join(file), text).unwrap();
     }
+    let calculator =
+        "from ase.calculators.emt import EMT\n\nversion = \"1\"\n\n\ndef calculator():\n    return EMT()\n";
+    fs::write(here.join("emt.py"), calculator).unwrap();
     build(here);
+    let validate =
+        ["calm", "validate", "--model", "model.toml", "--artifact", "al.npz", "--output", "validation"];
+    succeed(here, validate);
+    assert!(here.join("validation/validation.html").exists());
     let seeds = config("data/aluminium_seeds.extxyz").display().to_string();
     succeed(
         here,
@@ -279,4 +360,6 @@ fn mace_has_a_campaign() {
     );
     succeed(here, ["run", "campaign.toml", "--directory", "c"]);
     assert!(export(here, "c").contains("Al"));
+    let labelled = succeed(here, ["queue", "c", "list", "--state", "labelled"]);
+    assert!(labelled.lines().count() > 1, "{labelled}");
 }

@@ -3,10 +3,15 @@
 mod linked_cells;
 mod sites;
 
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use crate::cell::{self, Matrix3, Vec3};
 use crate::structure::{Structure, StructureError};
 use linked_cells::LinkedCells;
 use sites::Sites;
+
+/// Number of the next build of a list.
+static NEXT_BUILD: AtomicU64 = AtomicU64::new(1);
 
 /// An atom with more neighbours means overlapping atoms or a collapsed cell.
 const MAX_NEIGHBOURS: usize = 20_000;
@@ -52,6 +57,7 @@ pub struct NeighbourList {
     skin: f64,
     /// The structure for which the list was built.
     reference: Option<Structure>,
+    build_number: u64,
     offsets: Vec<usize>,
     /// Index of the first later neighbour of each atom.
     later: Vec<usize>,
@@ -66,6 +72,7 @@ impl NeighbourList {
             cutoff,
             skin,
             reference: None,
+            build_number: 0,
             offsets: vec![0],
             later: Vec::new(),
             neighbours: Vec::new(),
@@ -90,7 +97,14 @@ impl NeighbourList {
             return Err(error);
         }
         self.reference = Some(structure.clone());
+        self.build_number = NEXT_BUILD.fetch_add(1, Ordering::Relaxed);
         Ok(true)
+    }
+
+    /// Another number after each build of any list of this process: lists of the same number have the same neighbours. 0 without
+    /// a build.
+    pub fn build_number(&self) -> u64 {
+        self.build_number
     }
 
     /// All pairs within this distance are in the list, Å.
@@ -149,6 +163,7 @@ impl NeighbourList {
 
     fn clear(&mut self) {
         self.reference = None;
+        self.build_number = 0;
         self.offsets.truncate(1);
         self.later.clear();
         self.neighbours.clear();

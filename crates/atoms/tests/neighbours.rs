@@ -231,3 +231,20 @@ fn absurd_structures_are_refused_and_leave_an_empty_list() {
     broken.positions.clear();
     assert!(matches!(list.update(&broken), Err(StructureError::Length { .. })));
 }
+
+/// A list has another number after each build, which no other list has; a copy has the same neighbours and the same number.
+#[test]
+fn each_build_has_a_number() {
+    let structure = aluminium(vec![[0.0; 3], [2.8, 0.0, 0.0]], Cell([[0.0; 3]; 3]), [false; 3]);
+    let [mut list, mut other] = [0, 1].map(|_| NeighbourList::new(4.0, 0.5));
+    assert_eq!(list.build_number(), 0);
+    assert!(list.update(&structure).unwrap() && other.update(&structure).unwrap());
+    let first = list.build_number();
+    assert!(first != 0 && other.build_number() != first && list.clone().build_number() == first);
+    assert!(!list.update(&structure).unwrap() && list.build_number() == first);
+    let mut moved = structure.clone();
+    moved.positions[1][0] = 3.5;
+    assert!(list.update(&moved).unwrap() && list.build_number() != first);
+    moved.positions[1][0] = f64::NAN;
+    assert!(list.update(&moved).is_err() && list.build_number() == 0);
+}

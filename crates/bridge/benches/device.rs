@@ -42,7 +42,7 @@ fn radial(python: &Path, adapter: &str) -> PythonSettings {
 }
 
 fn start(settings: PythonSettings) -> Arc<Device> {
-    Arc::new(Device::start(settings, &CancellationToken::new(), |_| {}).expect("a device"))
+    Arc::new(Device::start(settings, false, &CancellationToken::new(), |_| {}).expect("a device"))
 }
 
 fn projected(model: PythonModel) -> Arc<PythonModel> {

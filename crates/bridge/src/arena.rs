@@ -2,15 +2,18 @@
 
 use std::fs::{File, OpenOptions};
 use std::io;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use memmap2::MmapMut;
 use rustix::fs::{FallocateFlags, fallocate};
 
+use crate::abandoned::{ARENA, hold};
+
 /// The smallest arena, bytes.
 const SMALLEST: usize = 1 << 20;
 
-/// A file that grows. The server maps it again when its path has changed.
+/// A file that grows, for this user only. The server maps it again when its path has changed.
 #[derive(Debug)]
 pub(crate) struct Arena {
     directory: PathBuf,
@@ -19,12 +22,21 @@ pub(crate) struct Arena {
     /// Whether the file still has its name.
     is_named: bool,
     map: Option<MmapMut>,
+    /// Holds a lock: what nobody holds was left by a killed program.
+    held: Option<File>,
 }
 
 impl Arena {
     /// An arena without memory, in a directory of shared memory.
     pub fn new(directory: &Path, number: usize) -> Self {
-        Self { directory: directory.to_owned(), number, path: PathBuf::new(), is_named: false, map: None }
+        Self {
+            directory: directory.to_owned(),
+            number,
+            path: PathBuf::new(),
+            is_named: false,
+            map: None,
+            held: None,
+        }
     }
 
     /// Makes room for so many bytes. Returns whether the contents are lost.
@@ -36,15 +48,22 @@ impl Arena {
             return Ok(false);
         }
         self.remove();
-        self.path = self.directory.join(unique_name(self.number));
         let size = bytes.next_power_of_two().max(SMALLEST);
-        let file = OpenOptions::new().read(true).write(true).create_new(true).open(&self.path)?;
+        let file = loop {
+            self.path = self.directory.join(unique_name(self.number));
+            let file =
+                OpenOptions::new().read(true).write(true).create_new(true).mode(0o600).open(&self.path)?;
+            if hold(&file, &self.path) {
+                break file;
+            }
+        };
         self.is_named = true;
         // Without memory behind it, a write would kill the process.
         let map = fallocate(&file, FallocateFlags::empty(), 0, size as u64)
             .map_err(io::Error::from)
             .and_then(|()| map(&file));
         self.map = Some(map.inspect_err(|_| self.unlink())?);
+        self.held = Some(file);
         Ok(true)
     }
 
@@ -73,6 +92,7 @@ impl Arena {
     fn remove(&mut self) {
         self.map = None;
         self.unlink();
+        self.held = None;
     }
 }
 
@@ -86,7 +106,8 @@ impl Drop for Arena {
 fn unique_name(number: usize) -> String {
     use std::sync::atomic::{AtomicU32, Ordering};
     static NEXT: AtomicU32 = AtomicU32::new(0);
-    format!("calmwalk-{}-{}-arena-{number}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed))
+    let (prefix, arena) = ARENA;
+    format!("{prefix}{}-{}{arena}{number}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed))
 }
 
 #[allow(unsafe_code)]
@@ -94,4 +115,20 @@ fn map(file: &File) -> io::Result<MmapMut> {
     // SAFETY: the file is new and has its full size. Only the server that this program started maps it too, and it writes only while
     // this program waits for its answer; whatever it writes, all of it are numbers of which any bits are valid.
     unsafe { MmapMut::map_mut(file) }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    #[test]
+    fn an_arena_is_for_this_user_only() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut arena = Arena::new(directory.path(), 0);
+        arena.reserve(100).unwrap();
+        let mode = std::fs::metadata(arena.path()).unwrap().permissions().mode();
+        assert_eq!(mode & 0o777, 0o600);
+    }
 }

@@ -13,7 +13,7 @@ use tempfile::NamedTempFile;
 use crate::description::ModelDescription;
 use crate::settings::PythonSettings;
 
-/// Characters of the model's hash in the file's name.
+/// Characters of the hash of model, adapter, precision and device in the file's name.
 const NAME_HASH: usize = 16;
 
 /// What a size was found for.
@@ -50,11 +50,10 @@ impl LimitFile {
     pub fn new(settings: &PythonSettings, description: &ModelDescription) -> Option<Self> {
         let directory = settings.cache.as_ref()?;
         let ModelDescription { identity, device, adapter, versions, precision, .. } = description.clone();
-        let plain = |text: &str| -> String {
-            text.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect()
-        };
-        let hash: String = plain(&identity).chars().take(NAME_HASH).collect();
-        let path = directory.join(format!("calmwalk-batch-{hash}-{}.json", plain(&device)));
+        let hash = blake3::hash(
+            [&identity, &adapter, &precision, &device].map(|one| format!("{one}\n")).concat().as_bytes(),
+        );
+        let path = directory.join(format!("calmwalk-batch-{}.json", &hash.to_hex()[..NAME_HASH]));
         let subject = LimitSubject { identity, device, adapter, versions, precision };
         Some(Self { path, subject, max_batch: settings.max_batch.get() })
     }
@@ -111,8 +110,17 @@ mod tests {
         here(32).write(4000).unwrap();
         assert_eq!([16, 32, 33].map(|most| here(most).read()), [Some(4000), Some(4000), None]);
         let other = |change: fn(&mut ModelDescription)| file(directory.path(), 32, change).read();
-        assert_eq!(other(|description| description.device = "cuda:1".to_owned()), None);
-        assert_eq!(other(|description| description.precision = "single".to_owned()), None);
+        // These are kept beside each other.
+        let changes: [fn(&mut ModelDescription); 4] = [
+            |description| description.device = "cuda:1".to_owned(),
+            |description| description.precision = "single".to_owned(),
+            |description| description.adapter = "mace.py:Mace".to_owned(),
+            |description| description.identity.push('c'),
+        ];
+        for change in changes {
+            assert_eq!(other(change), None);
+            assert_ne!(file(directory.path(), 32, change).path(), here(32).path());
+        }
         assert_eq!(
             other(|description| drop(description.versions.insert("torch".into(), "2.7".into()))),
             None

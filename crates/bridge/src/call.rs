@@ -61,12 +61,17 @@ impl Topology {
         listed.map(|(i, one)| (i, one.atom as i32, one.image)).eq(own.map(|((i, j), image)| (*i, *j, *image)))
     }
 
-    /// The topology of a structure whose neighbour list is up to date; `last` if that is the same.
-    pub(crate) fn of(species: &[usize], list: &NeighbourList, last: Option<&Arc<Self>>) -> Arc<Self> {
-        let is_same = |last: &&Arc<Self>| {
-            last.species.iter().map(|s| *s as usize).eq(species.iter().copied()) && last.has_bonds_of(list)
+    /// The topology of a structure whose neighbour list is up to date; `last`, which was that of the build of a list, if it is the same.
+    pub(crate) fn from_list(
+        species: &[usize],
+        list: &NeighbourList,
+        last: Option<&(u64, Arc<Self>)>,
+    ) -> Arc<Self> {
+        let is_same = |(build, last): &&(u64, Arc<Self>)| {
+            let is_built = *build == list.build_number() || last.has_bonds_of(list);
+            is_built && last.species.iter().map(|s| *s as usize).eq(species.iter().copied())
         };
-        if let Some(last) = last.filter(is_same) {
+        if let Some((_, last)) = last.filter(is_same) {
             return Arc::clone(last);
         }
         let mut found = Self { species: species.iter().map(|s| *s as i32).collect(), ..Self::default() };
@@ -83,7 +88,7 @@ impl Topology {
 
 impl BondGeometry {
     /// The geometry of a structure with these bonds.
-    pub(crate) fn of(structure: &Structure, topology: Arc<Topology>) -> Self {
+    pub(crate) fn from_structure(structure: &Structure, topology: Arc<Topology>) -> Self {
         Self {
             topology,
             positions: structure.positions.clone(),

@@ -65,7 +65,7 @@ impl ClientPool {
     }
 
     /// Keeps a client that is no longer used.
-    pub fn give_back(&self, client: Client) {
+    pub fn release(&self, client: Client) {
         self.idle.lock().unwrap_or_else(PoisonError::into_inner).push(client);
     }
 }

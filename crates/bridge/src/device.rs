@@ -1,6 +1,8 @@
 //! A device with a model: one server for all walkers of a host.
 
-use std::path::{Path, PathBuf};
+use std::fs::File;
+use std::io;
+use std::path::Path;
 use std::sync::mpsc::{self, Sender};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
@@ -10,6 +12,7 @@ use tempfile::TempDir;
 use tokio_util::sync::CancellationToken;
 use wire::DeviceStatistics;
 
+use crate::abandoned::{PACKAGE_PREFIX, hold, memory, remove_abandoned};
 use crate::call::{BondGeometry, Call, Topology};
 use crate::error::{CallError, DeviceError};
 use crate::events::DeviceEvent;
@@ -29,30 +32,52 @@ pub struct Device {
     /// Cancelled when the device has failed for good.
     broken: CancellationToken,
     /// Where the server's package is.
-    _package: TempDir,
+    _package: PackageDir,
 }
 
-/// Writes the package to a directory of its own.
-fn write_package() -> Result<TempDir, DeviceError> {
-    let failed = |source| DeviceError::File { path: std::env::temp_dir().display().to_string(), source };
-    let directory = tempfile::Builder::new().prefix("calmwalk-python-").tempdir().map_err(failed)?;
-    crate::package::write(directory.path()).map_err(failed)?;
-    Ok(directory)
+/// A directory with the server's package, which is removed on drop.
+#[derive(Debug)]
+pub(crate) struct PackageDir {
+    directory: TempDir,
+    /// Closing it releases the lock.
+    _held: File,
 }
 
-/// Where files are in memory.
-fn memory() -> PathBuf {
-    let shared = Path::new("/dev/shm");
-    if shared.is_dir() { shared.to_owned() } else { std::env::temp_dir() }
+impl PackageDir {
+    /// Writes the package to a directory of its own in this one.
+    ///
+    /// # Errors
+    /// Errors of the file system.
+    pub fn new_in(parent: &Path) -> io::Result<Self> {
+        loop {
+            let directory = tempfile::Builder::new().prefix(PACKAGE_PREFIX).tempdir_in(parent)?;
+            let _held = match File::open(directory.path()) {
+                // Another process removed it as abandoned.
+                Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+                opened => opened?,
+            };
+            if hold(&_held, directory.path()) {
+                crate::package::write(directory.path())?;
+                return Ok(Self { directory, _held });
+            }
+        }
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        self.directory.path()
+    }
 }
 
 impl Device {
-    /// Starts a server, and tests its model. `progress` gets what is being done.
+    /// Starts a server, and tests its model. `progress` gets what is being done. With `same_bits`, a server that is started again later
+    /// must give the same bits.
     ///
     /// # Errors
     /// A server that does not start, or a model that fails the test.
     pub fn start(
         settings: PythonSettings,
+        same_bits: bool,
         stop: &CancellationToken,
         progress: impl Fn(&str) + Send + 'static,
     ) -> Result<Self, DeviceError> {
@@ -61,9 +86,13 @@ impl Device {
         let statistics = Arc::new(Mutex::new(DeviceStatistics::default()));
         let (events, incoming) = mpsc::channel();
         let (ready, started) = mpsc::sync_channel(1);
-        let package = write_package()?;
+        remove_abandoned();
+        let temporary = std::env::temp_dir();
+        let package = PackageDir::new_in(&temporary)
+            .map_err(|source| DeviceError::File { path: temporary.display().to_string(), source })?;
         let setup = DeviceSetup {
             settings,
+            same_bits,
             package: package.path().to_owned(),
             memory: memory(),
             events: events.clone(),
@@ -106,11 +135,12 @@ impl Device {
     }
 
     /// Evaluates copies of a structure in batches of one, two, four, … of them, up to `most`: frameworks compile, and it is found how many
-    /// the memory of the device takes. Of use for devices other than a processor, and for frameworks that compile.
+    /// the memory of the device takes. Returns whether each copy has the same bits, whatever the size of the batch. Of use for devices other
+    /// than a processor, for frameworks that compile, and where bits matter.
     ///
     /// # Errors
     /// An element that the model does not support, or an invalid structure.
-    pub fn warm_up(&self, structure: &Structure, skin: f64, most: usize) -> Result<(), String> {
+    pub fn warm_up(&self, structure: &Structure, skin: f64, most: usize) -> Result<bool, String> {
         let description = self.info.description();
         let index = |species: &Species| {
             let known = description.elements.iter().position(|symbol| symbol == species.symbol());
@@ -119,13 +149,11 @@ impl Device {
         let species = structure.species.iter().map(index).collect::<Result<Vec<_>, _>>()?;
         let mut list = NeighbourList::new(description.cutoff(), skin);
         list.update(structure).map_err(|error| error.to_string())?;
-        let geometry = BondGeometry::of(structure, Topology::of(&species, &list, None));
+        let geometry = BondGeometry::from_structure(structure, Topology::from_list(&species, &list, None));
         let (done, ended) = mpsc::sync_channel(1);
-        if self.events.send(DeviceEvent::WarmUp { geometry, most, done }).is_ok() {
-            // The thread may have crashed.
-            let _ = ended.recv();
-        }
-        Ok(())
+        // A thread that has crashed has refuted nothing.
+        let is_sent = self.events.send(DeviceEvent::WarmUp { geometry, most, done }).is_ok();
+        Ok(!is_sent || ended.recv().unwrap_or(true))
     }
 
     /// A call of a client of this process. Returns when it has its result: energies `[n]`, forces `[n × 3]`, virial `[9]` and

@@ -1,4 +1,4 @@
-//! Why a device, or a call, gives nothing.
+//! Errors of devices and calls.
 
 use crate::self_test::SelfTestError;
 

@@ -11,10 +11,11 @@ use crate::recipient::Recipient;
 pub(crate) enum DeviceEvent {
     /// A client calls.
     Call { client: u64, call: Result<Call, String>, recipient: Recipient },
-    /// A server has something to say.
+    /// A server has sent a line, or has ended.
     Server { generation: u64, event: ServerEvent },
-    /// Evaluate copies of a structure in batches of all sizes, so that programs are compiled and memory is known.
-    WarmUp { geometry: BondGeometry, most: usize, done: SyncSender<()> },
+    /// Evaluate copies of a structure in batches of all sizes, so that programs are compiled and memory is known. `done` gets whether each
+    /// copy has the same bits.
+    WarmUp { geometry: BondGeometry, most: usize, done: SyncSender<bool> },
     /// The device ends.
     Close,
 }

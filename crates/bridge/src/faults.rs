@@ -4,7 +4,7 @@ use serde::Deserialize;
 
 /// A fault of a server or of a call.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Fault {
+pub(crate) enum ServerFault {
     /// The process has exited, or cannot be reached.
     Exited(String),
     /// It has not answered in time.
@@ -21,7 +21,7 @@ pub(crate) enum Fault {
     Stopped,
 }
 
-impl Fault {
+impl ServerFault {
     /// In words.
     pub fn message(&self) -> &str {
         match self {
@@ -59,10 +59,11 @@ impl Reply {
     ///
     /// # Errors
     /// A line that does not, or an error that it reports.
-    pub fn read(line: &str, id: Option<u64>, names: &str) -> Result<Self, Fault> {
+    pub fn read(line: &str, id: Option<u64>, names: &str) -> Result<Self, ServerFault> {
         let excerpt = || line.chars().take(200).collect::<String>();
-        let reply: Self = serde_json::from_str(line)
-            .map_err(|error| Fault::Nonsense(format!("{names}: the answer '{}': {error}", excerpt())))?;
+        let reply: Self = serde_json::from_str(line).map_err(|error| {
+            ServerFault::Nonsense(format!("{names}: the answer '{}': {error}", excerpt()))
+        })?;
         if reply.status == "error" {
             let message = reply.message.unwrap_or_else(|| "an error without a message".to_owned());
             // It begins with the adapter's name, as `names` does.
@@ -75,13 +76,13 @@ impl Reply {
                 None => format!("{names}, {message}"),
             };
             return Err(match reply.kind.as_deref() {
-                Some("memory") => Fault::Memory(message),
-                _ => Fault::Reported(message),
+                Some("memory") => ServerFault::Memory(message),
+                _ => ServerFault::Reported(message),
             });
         }
         if reply.status != "ok" || reply.id != id {
             let expected = id.map_or_else(String::new, |id| format!(" to call {id}"));
-            return Err(Fault::Nonsense(format!("{names}: '{}' is no answer{expected}", excerpt())));
+            return Err(ServerFault::Nonsense(format!("{names}: '{}' is no answer{expected}", excerpt())));
         }
         Ok(reply)
     }

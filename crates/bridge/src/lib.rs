@@ -4,6 +4,7 @@
 //! walkers in batches. A [`PythonModel`] is what the walkers see: a model like any other, whose evaluators call the device, in the same
 //! process or through shared memory ([`DeviceService`]).
 
+mod abandoned;
 mod arena;
 mod batch;
 mod batch_limit;
@@ -20,17 +21,19 @@ mod package;
 mod process;
 mod recipient;
 mod recovery;
-mod running;
 mod same_model;
 mod schedule;
 mod self_test;
 mod server;
+mod server_loop;
 mod service;
 mod settings;
 mod setup;
 mod shapes;
+mod warm_up;
 mod worker;
 
+pub use abandoned::remove_abandoned;
 pub use call::{BondGeometry, Topology};
 pub use description::{AdapterFeatures, ModelDescription, RawFeatures};
 pub use device::Device;

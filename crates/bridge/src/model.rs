@@ -129,7 +129,8 @@ impl ModelWithFeatures for PythonModel {
 pub struct PythonPotential {
     model: Arc<PythonModel>,
     client: Option<Client>,
-    topology: Option<Arc<Topology>>,
+    /// Of the last structure, and the build of its neighbour list.
+    topology: Option<(u64, Arc<Topology>)>,
     /// Of the last forward pass.
     energy: Evaluation,
     /// As the adapter gives them.
@@ -163,9 +164,9 @@ impl PythonPotential {
             return Err(PotentialError::Cutoff { list: neighbours.cutoff(), needed });
         }
         let species = self.model.element_indices(&structure.species)?;
-        let topology = Topology::of(&species, neighbours, self.topology.as_ref());
-        self.topology = Some(Arc::clone(&topology));
-        let geometry = BondGeometry::of(structure, topology);
+        let topology = Topology::from_list(&species, neighbours, self.topology.as_ref());
+        self.topology = Some((neighbours.build_number(), Arc::clone(&topology)));
+        let geometry = BondGeometry::from_structure(structure, topology);
         let numbers = self.client()?.evaluate(geometry, (features, pull_back_follows))?;
         let n = structure.len();
         let width = if features { self.model.description().features.dimension } else { 0 };
@@ -300,7 +301,7 @@ impl PotentialWithFeatures for PythonPotential {
 impl Drop for PythonPotential {
     fn drop(&mut self) {
         if let Some(client) = self.client.take() {
-            self.model.clients.give_back(client);
+            self.model.clients.release(client);
         }
     }
 }

@@ -1,7 +1,7 @@
 //! The server's process: lines to it, and what comes back.
 
 use std::collections::VecDeque;
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::path::Path;
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::mpsc::Sender;
@@ -18,7 +18,7 @@ const KEPT_LINES: usize = 12;
 /// How often an exit is looked for before the process is killed.
 const EXIT_POLLS: u32 = 20;
 
-/// What a server has to say.
+/// Events of a server process.
 #[derive(Debug)]
 pub(crate) enum ServerEvent {
     /// A line of its standard output.
@@ -27,11 +27,12 @@ pub(crate) enum ServerEvent {
     Ended,
 }
 
-/// A running server.
+/// A running server. Dropping it ends it.
 #[derive(Debug)]
 pub(crate) struct ServerProcess {
     child: Child,
-    input: ChildStdin,
+    /// Its standard input, until it is asked to end.
+    input: Option<ChildStdin>,
     last_lines: Arc<Mutex<VecDeque<String>>>,
 }
 
@@ -49,8 +50,13 @@ impl ServerProcess {
         let program = settings.program();
         let mut words = settings.launcher.iter().map(std::ffi::OsStr::new).chain([program.as_os_str()]);
         let mut command = Command::new(words.next().unwrap_or_default());
-        // Modules of the working directory would come before those of the environment.
-        command.args(words).args(["-m", "calmwalk.server"]).current_dir(package);
+        command.args(words).args(["-m", "calmwalk.server"]);
+        // Modules of the working directory would come before those of the environment. A launcher may have words that are relative paths.
+        if settings.launcher.is_empty() {
+            command.current_dir(package);
+        } else {
+            command.env("PYTHONSAFEPATH", "1");
+        }
         let path = match std::env::var_os("PYTHONPATH").filter(|path| !path.is_empty()) {
             None => package.as_os_str().to_owned(),
             Some(others) => {
@@ -85,7 +91,7 @@ impl ServerProcess {
             }
             let _ = events.send(tag(ServerEvent::Ended));
         });
-        Ok(Self { child, input, last_lines })
+        Ok(Self { child, input: Some(input), last_lines })
     }
 
     /// Sends a line.
@@ -93,9 +99,10 @@ impl ServerProcess {
     /// # Errors
     /// The server has exited.
     pub fn send(&mut self, line: &str) -> std::io::Result<()> {
-        self.input.write_all(line.as_bytes())?;
-        self.input.write_all(b"\n")?;
-        self.input.flush()
+        let input = self.input.as_mut().ok_or(ErrorKind::BrokenPipe)?;
+        input.write_all(line.as_bytes())?;
+        input.write_all(b"\n")?;
+        input.flush()
     }
 
     /// The process.
@@ -105,14 +112,7 @@ impl ServerProcess {
 
     /// Ends it and says how it ended, with the last lines that it wrote.
     pub fn end(mut self) -> String {
-        let ended = match self.wait_for_exit() {
-            Some(status) => status.to_string(),
-            None => {
-                let _ = self.child.kill();
-                let _ = self.child.wait();
-                "killed".to_owned()
-            }
-        };
+        let ended = self.close().map_or_else(|| "killed".to_owned(), |status| status.to_string());
         let lines = self.last_lines.lock().unwrap_or_else(PoisonError::into_inner);
         let lines: Vec<_> = lines.iter().map(String::as_str).collect();
         if lines.is_empty() { ended } else { format!("{ended}; its last lines:\n  {}", lines.join("\n  ")) }
@@ -120,15 +120,24 @@ impl ServerProcess {
 }
 
 impl ServerProcess {
-    /// How it has ended. Who closes its standard output ends a moment later.
-    fn wait_for_exit(&mut self) -> Option<ExitStatus> {
+    /// Closes its standard input, which ends it, and says how it has ended. One that is in a call, or hangs, is killed.
+    fn close(&mut self) -> Option<ExitStatus> {
+        self.input = None;
         for _ in 0..EXIT_POLLS {
             if let Ok(Some(status)) = self.child.try_wait() {
                 return Some(status);
             }
             thread::sleep(Duration::from_millis(10));
         }
+        let _ = self.child.kill();
+        let _ = self.child.wait();
         None
+    }
+}
+
+impl Drop for ServerProcess {
+    fn drop(&mut self) {
+        self.close();
     }
 }
 
@@ -141,5 +150,34 @@ fn read_errors(errors: impl Read, keep: &Mutex<VecDeque<String>>) {
             kept.pop_front();
         }
         kept.push_back(line);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc;
+
+    use super::*;
+
+    /// A program that a shell runs in place of Python.
+    fn start(script: &str) -> ServerProcess {
+        let mut settings = PythonSettings::new(Path::new("python"), "none", None);
+        settings.launcher = ["sh", "-c", script].map(str::to_owned).to_vec();
+        ServerProcess::start(&settings, Path::new("/"), mpsc::channel().0, |event| event).unwrap()
+    }
+
+    #[test]
+    fn a_server_exits_at_the_end_of_its_input() {
+        assert_eq!(start("cat; exit 0").end(), "exit status: 0");
+        assert_eq!(start("trap '' TERM; while :; do sleep 1; done").end(), "killed");
+    }
+
+    #[test]
+    fn dropping_a_server_ends_it() {
+        let server = start("exec sleep 600");
+        let process = format!("/proc/{}", server.pid());
+        assert!(Path::new(&process).exists());
+        drop(server);
+        assert!(!Path::new(&process).exists());
     }
 }

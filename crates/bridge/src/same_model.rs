@@ -23,10 +23,7 @@ impl ModelReference {
     /// # Errors
     /// What differs: what was found and what was expected.
     pub fn check(&self, found: &Self, same_bits: bool) -> Result<(), String> {
-        let differences = self.description.differences(&found.description);
-        if !differences.is_empty() {
-            return Err(differences.join("; "));
-        }
+        self.description.check_same(&found.description)?;
         if !have_same_energies(&found.energies, &self.energies) {
             let [energy, expected] = [found, self].map(|one| one.energies.iter().sum::<f64>());
             return Err(format!("energy of the test structure {energy} eV, expected {expected} eV"));
@@ -44,6 +41,15 @@ impl ModelReference {
 }
 
 impl ModelDescription {
+    /// Checks that another server says the same of its model.
+    ///
+    /// # Errors
+    /// What differs: what was found and what was expected.
+    pub(crate) fn check_same(&self, found: &Self) -> Result<(), String> {
+        let differences = self.differences(found);
+        if differences.is_empty() { Ok(()) } else { Err(differences.join("; ")) }
+    }
+
     /// What of another server's model is not as here: what was found and what was expected.
     fn differences(&self, found: &Self) -> Vec<String> {
         let facts = |one: &Self| {
@@ -64,7 +70,7 @@ impl ModelDescription {
     }
 
     /// For instance `cuda:0 with python 3.11.7, torch 2.6.0`.
-    fn device_and_versions(&self) -> String {
+    pub(crate) fn device_and_versions(&self) -> String {
         let versions: Vec<_> =
             self.versions.iter().map(|(name, version)| format!("{name} {version}")).collect();
         format!("{} with {}", self.device, versions.join(", "))

@@ -135,9 +135,16 @@ impl<M: Evaluate> SelfTest<'_, M> {
     }
 
     fn pull_back(&mut self, structure: &Structure, cotangent: &[f64]) -> Result<TestResult, SelfTestError> {
-        let geometry = geometry(structure, self.subject, 0.3)?;
-        let results = self.model.pull_back(&[&geometry], &[cotangent]).map_err(SelfTestError::Call)?;
+        let results = self.pull_back_all(&[(structure, cotangent)])?;
         results.into_iter().next().ok_or_else(|| SelfTestError::Call("no result".to_owned()))
+    }
+
+    fn pull_back_all(&mut self, all: &[(&Structure, &[f64])]) -> Result<Vec<TestResult>, SelfTestError> {
+        let geometries = all.iter().map(|(one, _)| geometry(one, self.subject, 0.3));
+        let geometries = geometries.collect::<Result<Vec<_>, _>>()?;
+        let references: Vec<_> = geometries.iter().collect();
+        let cotangents: Vec<_> = all.iter().map(|(_, cotangent)| *cotangent).collect();
+        self.model.pull_back(&references, &cotangents).map_err(SelfTestError::Call)
     }
 
     fn compare(&mut self, what: String, error: f64, tolerance: f64) {
@@ -286,6 +293,10 @@ impl<M: Evaluate> SelfTest<'_, M> {
         if !cotangent.is_empty() {
             let first = self.pull_back(cluster, &cotangent)?;
             self.report.is_deterministic &= first == self.pull_back(cluster, &cotangent)?;
+            let of_crystal = random_numbers(crystal.len() * self.subject.dimension, 10);
+            let neighbour = (crystal, &of_crystal[..]);
+            let beside = self.pull_back_all(&[neighbour, (cluster, &cotangent), neighbour])?;
+            self.report.is_batch_independent &= beside.get(1) == Some(&first);
         }
         Ok(())
     }
@@ -328,7 +339,7 @@ fn geometry(
     let index =
         |species: &Species| subject.elements.iter().position(|known| known == species).unwrap_or_default();
     let species: Vec<usize> = structure.species.iter().map(index).collect();
-    Ok(BondGeometry::of(structure, Topology::of(&species, &list, None)))
+    Ok(BondGeometry::from_structure(structure, Topology::from_list(&species, &list, None)))
 }
 
 /// Eight atoms on a distorted cubic lattice, of all elements in turn.
@@ -370,7 +381,7 @@ fn symmetric(six: &[f64]) -> [[f64; 3]; 3] {
 }
 
 /// Numbers between −1 and 1, always the same ones (a multiplicative congruential generator, Park & Miller 1988).
-fn random_numbers(count: usize, seed: u64) -> Vec<f64> {
+pub(crate) fn random_numbers(count: usize, seed: u64) -> Vec<f64> {
     let mut state = 1 + seed * 7919;
     let mut next = || {
         state = state * 48271 % 2_147_483_647;

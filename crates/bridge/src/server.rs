@@ -11,7 +11,7 @@ use crate::batch::{BatchArena, BatchKind};
 use crate::call::BondGeometry;
 use crate::description::{AdapterFeatures, ModelDescription, PROTOCOL};
 use crate::events::DeviceEvent;
-use crate::faults::{Fault, Reply};
+use crate::faults::{Reply, ServerFault};
 use crate::process::{ServerEvent, ServerProcess};
 use crate::self_test::{Evaluate, TestResult};
 use crate::settings::PythonSettings;
@@ -19,7 +19,7 @@ use crate::setup::DeviceSetup;
 use crate::shapes::Shape;
 
 /// Interval at which a synchronous call looks whether the device was asked to stop.
-const LOOK_AROUND: Duration = Duration::from_millis(200);
+const POLL_INTERVAL: Duration = Duration::from_millis(200);
 
 /// A call that the server has not answered yet.
 #[derive(Clone, Debug)]
@@ -27,8 +27,17 @@ pub(crate) struct Outstanding {
     pub id: u64,
     pub kind: BatchKind,
     pub slot: usize,
-    pub sent: Instant,
-    pub deadline: Instant,
+    /// When the server could begin with it: it was sent, and the call before it was answered.
+    pub begun: Instant,
+    /// Time for it from then on.
+    pub timeout: Duration,
+}
+
+impl Outstanding {
+    /// When its answer is overdue.
+    pub fn deadline(&self) -> Instant {
+        self.begun + self.timeout
+    }
 }
 
 /// A started server that has said hello.
@@ -37,7 +46,7 @@ pub(crate) struct Server {
     generation: u64,
     pub description: ModelDescription,
     pub arenas: [BatchArena; 2],
-    /// Shapes that were evaluated or pulled back since the start: later calls of them are quick.
+    /// Shapes ([`Self::program_shape`]) that were evaluated or pulled back since the start: later calls of them are quick.
     known_shapes: HashSet<(Shape, bool)>,
     next_id: u64,
     /// Id of the last evaluation in each arena.
@@ -49,11 +58,15 @@ impl Server {
     ///
     /// # Errors
     /// Why there is none.
-    pub fn start(setup: &DeviceSetup, generation: u64, early: &mut Vec<DeviceEvent>) -> Result<Self, Fault> {
+    pub fn start(
+        setup: &DeviceSetup,
+        generation: u64,
+        early: &mut Vec<DeviceEvent>,
+    ) -> Result<Self, ServerFault> {
         let settings = &setup.settings;
         let tag = move |event| DeviceEvent::Server { generation, event };
         let mut process = ServerProcess::start(settings, &setup.package, setup.events.clone(), tag)
-            .map_err(Fault::Exited)?;
+            .map_err(ServerFault::Exited)?;
         let precision = match settings.precision {
             Precision::Double => "double",
             Precision::Mixed => "single",
@@ -64,13 +77,14 @@ impl Server {
         });
         let sent = process.send(&hello.to_string());
         let deadline = Instant::now() + settings.compile_timeout;
-        let wait = Wait { setup, generation, early };
+        let wait = LineReader { setup, generation, early };
         let line = sent
-            .map_err(|error| Fault::Exited(format!("{}: {error}", settings.names())))
+            .map_err(|error| ServerFault::Exited(format!("{}: {error}", settings.names())))
             .and_then(|()| wait.line(deadline, "hello"));
         let description = line.and_then(|line| {
             Reply::read(&line, None, &settings.names())?;
-            let nonsense = |error: String| Fault::Reported(format!("{}, hello: {error}", settings.names()));
+            let nonsense =
+                |error: String| ServerFault::Reported(format!("{}, hello: {error}", settings.names()));
             let description: ModelDescription =
                 serde_json::from_str(&line).map_err(|error| nonsense(error.to_string()))?;
             description.check().map_err(nonsense)?;
@@ -101,7 +115,7 @@ impl Server {
     }
 
     /// Ends it. A fault that says nothing of the process gets its last words.
-    pub fn end(self, fault: Fault) -> Fault {
+    pub fn end(self, fault: ServerFault) -> ServerFault {
         with_end(fault, self.process)
     }
 
@@ -109,11 +123,11 @@ impl Server {
     ///
     /// # Errors
     /// Shared memory that is full.
-    pub fn write(&mut self, slot: usize, structures: &[&BondGeometry]) -> Result<(), Fault> {
+    pub fn write(&mut self, slot: usize, structures: &[&BondGeometry]) -> Result<(), ServerFault> {
         let (padding, cutoff) = (self.description.padding, self.description.cutoff());
         self.evaluations[slot] = None;
         let written = self.arenas[slot].write(structures, padding, cutoff);
-        written.map_err(|error| Fault::Arena(format!("shared memory for a batch: {error}")))
+        written.map_err(|error| ServerFault::Arena(format!("shared memory for a batch: {error}")))
     }
 
     /// Sends the batch of a slot.
@@ -125,7 +139,7 @@ impl Server {
         slot: usize,
         evaluates: Option<bool>,
         settings: &PythonSettings,
-    ) -> Result<Outstanding, Fault> {
+    ) -> Result<Outstanding, ServerFault> {
         let id = self.next_id;
         self.next_id += 1;
         let kind = match evaluates {
@@ -134,71 +148,86 @@ impl Server {
         };
         self.evaluations[slot] = evaluates.is_some().then_some(id);
         let arena = &self.arenas[slot];
-        let is_known = self.known_shapes.contains(&(arena.shape(), evaluates.is_some()));
+        let is_known = self.known_shapes.contains(&(self.program_shape(slot), evaluates.is_some()));
         let timeout = if is_known { settings.timeout } else { settings.compile_timeout };
         let message = arena.message(id, kind);
         let sent = self.process.send(&message);
-        sent.map_err(|error| Fault::Exited(format!("{}: {error}", settings.names())))?;
-        let now = Instant::now();
-        Ok(Outstanding { id, kind, slot, sent: now, deadline: now + timeout })
+        sent.map_err(|error| ServerFault::Exited(format!("{}: {error}", settings.names())))?;
+        Ok(Outstanding { id, kind, slot, begun: Instant::now(), timeout })
+    }
+
+    /// What decides whether a framework has a program for the batch of a slot. Without padding there is a new number of bonds in nearly
+    /// every batch, and a program is not made for each: only the size of the batch counts.
+    fn program_shape(&self, slot: usize) -> Shape {
+        let shape = self.arenas[slot].shape();
+        if self.description.padding {
+            shape
+        } else {
+            Shape { atoms: shape.atoms.next_power_of_two(), ..Shape::default() }
+        }
     }
 
     /// Takes in the answer to the oldest call. Returns whether the shape was new, and the time that the adapter took, s.
     ///
     /// # Errors
     /// What the server reports, or that the line is no answer.
-    pub fn answer(&mut self, line: &str, call: &Outstanding, names: &str) -> Result<(bool, f64), Fault> {
+    pub fn answer(
+        &mut self,
+        line: &str,
+        call: &Outstanding,
+        names: &str,
+    ) -> Result<(bool, f64), ServerFault> {
         let reply = Reply::read(line, Some(call.id), names)?;
         let evaluates = matches!(call.kind, BatchKind::Evaluate { .. });
         self.arenas[call.slot].unlink();
-        let is_new = self.known_shapes.insert((self.arenas[call.slot].shape(), evaluates));
+        let is_new = self.known_shapes.insert((self.program_shape(call.slot), evaluates));
         Ok((reply.compiled || (is_new && self.description.padding), reply.seconds))
     }
 }
 
 /// The fault with how the process ended.
-fn with_end(fault: Fault, process: ServerProcess) -> Fault {
+fn with_end(fault: ServerFault, process: ServerProcess) -> ServerFault {
     let ended = process.end();
     match fault {
-        Fault::Exited(message) => Fault::Exited(format!("{message}; the server ended: {ended}")),
-        Fault::Timeout(message) => Fault::Timeout(format!("{message}; the server: {ended}")),
+        ServerFault::Exited(message) => ServerFault::Exited(format!("{message}; the server ended: {ended}")),
+        ServerFault::Timeout(message) => ServerFault::Timeout(format!("{message}; the server: {ended}")),
         other => other,
     }
 }
 
 /// Waits for a line of a server, and keeps other events.
-pub(crate) struct Wait<'a> {
+pub(crate) struct LineReader<'a> {
     pub setup: &'a DeviceSetup,
     pub generation: u64,
     pub early: &'a mut Vec<DeviceEvent>,
 }
 
-impl Wait<'_> {
+impl LineReader<'_> {
     /// The next line.
     ///
     /// # Errors
     /// None has come in time, the server has exited, or the device was asked to stop.
-    pub fn line(self, deadline: Instant, call: &str) -> Result<String, Fault> {
+    pub fn line(self, deadline: Instant, call: &str) -> Result<String, ServerFault> {
         let names = self.setup.settings.names();
         loop {
             if self.setup.stop.is_cancelled() {
-                return Err(Fault::Stopped);
+                return Err(ServerFault::Stopped);
             }
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
-                return Err(Fault::Timeout(format!("{names}, {call}: no answer in time")));
+                return Err(ServerFault::Timeout(format!("{names}, {call}: no answer in time")));
             }
-            match self.setup.incoming.recv_timeout(left.min(LOOK_AROUND)) {
+            match self.setup.incoming.recv_timeout(left.min(POLL_INTERVAL)) {
                 Ok(DeviceEvent::Server { generation, event }) if generation == self.generation => match event
                 {
                     ServerEvent::Line(line) => return Ok(line),
                     ServerEvent::Ended => {
-                        return Err(Fault::Exited(format!("{names}, {call}: no answer")));
+                        return Err(ServerFault::Exited(format!("{names}, {call}: no answer")));
                     }
                 },
                 Ok(DeviceEvent::Server { .. }) | Err(RecvTimeoutError::Timeout) => {}
                 Ok(other) => self.early.push(other),
-                Err(RecvTimeoutError::Disconnected) => return Err(Fault::Stopped),
+                Err(RecvTimeoutError::Disconnected) => return Err(ServerFault::Stopped),
             }
         }
     }
@@ -210,36 +239,37 @@ pub(crate) struct Synchronous<'a> {
     pub setup: &'a DeviceSetup,
     pub early: &'a mut Vec<DeviceEvent>,
     /// The last fault, as the test knows messages only.
-    pub fault: Option<Fault>,
+    pub fault: Option<ServerFault>,
 }
 
 impl Synchronous<'_> {
-    /// Sends the batch in the first arena and waits.
+    /// Sends a batch in the arena of a slot and waits.
     ///
     /// # Errors
     /// Faults of the server.
     pub fn round_trip(
         &mut self,
+        slot: usize,
         structures: &[&BondGeometry],
         cotangents: Option<&[&[f64]]>,
-    ) -> Result<Vec<TestResult>, Fault> {
+    ) -> Result<Vec<TestResult>, ServerFault> {
         let settings = &self.setup.settings;
-        self.server.write(0, structures)?;
+        self.server.write(slot, structures)?;
         if let Some(cotangents) = cotangents {
-            self.server.arenas[0].write_cotangents(cotangents.iter().map(|one| Some(*one)));
+            self.server.arenas[slot].write_cotangents(cotangents.iter().map(|one| Some(*one)));
         }
         let has_features = self.server.description.features.form != AdapterFeatures::None;
         let evaluates = cotangents.is_none().then_some(has_features);
-        let call = self.server.send(0, evaluates, settings)?;
+        let call = self.server.send(slot, evaluates, settings)?;
         let generation = self.server.generation;
-        let wait = Wait { setup: self.setup, generation, early: self.early };
+        let wait = LineReader { setup: self.setup, generation, early: self.early };
         let what = if evaluates.is_some() { "evaluate" } else { "pull_back" };
-        let line = wait.line(call.deadline, what)?;
+        let line = wait.line(call.deadline(), what)?;
         self.server.answer(&line, &call, &settings.names())?;
         let results = (0..structures.len()).map(|k| {
-            let parts = self.server.arenas[0].result(k, call.kind);
+            let parts = self.server.arenas[slot].result(k, call.kind);
             match parts.not_finite() {
-                Some(what) => Err(Fault::Reported(format!("{}, {what}", settings.names()))),
+                Some(what) => Err(ServerFault::Reported(format!("{}, {what}", settings.names()))),
                 None => Ok(TestResult {
                     energies: parts.energies.to_vec(),
                     vectors: parts.vectors.to_vec(),
@@ -251,7 +281,7 @@ impl Synchronous<'_> {
         results.collect()
     }
 
-    fn keep_fault<T>(&mut self, result: Result<T, Fault>) -> Result<T, String> {
+    fn keep_fault<T>(&mut self, result: Result<T, ServerFault>) -> Result<T, String> {
         result.map_err(|fault| {
             let message = fault.message().to_owned();
             self.fault = Some(fault);
@@ -262,7 +292,7 @@ impl Synchronous<'_> {
 
 impl Evaluate for Synchronous<'_> {
     fn evaluate(&mut self, structures: &[&BondGeometry]) -> Result<Vec<TestResult>, String> {
-        let result = self.round_trip(structures, None);
+        let result = self.round_trip(0, structures, None);
         self.keep_fault(result)
     }
 
@@ -271,7 +301,7 @@ impl Evaluate for Synchronous<'_> {
         structures: &[&BondGeometry],
         cotangents: &[&[f64]],
     ) -> Result<Vec<TestResult>, String> {
-        let result = self.round_trip(structures, Some(cotangents));
+        let result = self.round_trip(0, structures, Some(cotangents));
         self.keep_fault(result)
     }
 }

@@ -13,7 +13,8 @@ use serde::{Deserialize, Serialize};
 pub struct PythonSettings {
     /// Directory of a virtual environment or of a conda environment (with `bin/python`), or a Python program.
     pub environment: PathBuf,
-    /// Words before the Python program, for instance `apptainer exec image.sif`; `environment` is then the program inside.
+    /// Words before the Python program, for instance `apptainer exec image.sif`; `environment` is then the program inside. Relative paths
+    /// are relative to the working directory.
     pub launcher: Vec<String>,
     /// An adapter of the package, or one of the user: `module:Class` or `file.py:Class`.
     pub adapter: String,
@@ -63,7 +64,7 @@ impl PythonSettings {
     }
 
     /// The Python program. Behind a launcher, only that knows what the environment is.
-    pub(crate) fn program(&self) -> PathBuf {
+    pub fn program(&self) -> PathBuf {
         let is_directory = self.launcher.is_empty() && self.environment.is_dir();
         if is_directory { self.environment.join("bin/python") } else { self.environment.clone() }
     }

@@ -13,6 +13,8 @@ use crate::settings::PythonSettings;
 /// Settings, places, and the ends of channels.
 pub(crate) struct DeviceSetup {
     pub settings: PythonSettings,
+    /// Whether a server that is started again must give the same bits.
+    pub same_bits: bool,
     /// Where the package is.
     pub package: PathBuf,
     /// Where arenas are made.

@@ -21,13 +21,16 @@ impl Shape {
         }
     }
 
-    /// The shape with room for a spare structure and a spare atom, which own what is padding: powers of two for structures, steps of
-    /// at most a quarter for atoms and bonds.
+    /// The shape with room for a spare structure and a spare atom, which own what is padding: a power of two of structures, and the atoms
+    /// and bonds of that many such structures, in steps of at most a quarter. So three structures have the shape of four, for which the
+    /// program was compiled at the start.
     pub fn padded(self) -> Self {
+        let structures = self.structures.next_power_of_two();
+        let of_all = |count: usize| (count * structures).div_ceil(self.structures.max(1));
         Self {
-            structures: self.structures.next_power_of_two() + 1,
-            atoms: step_above(self.atoms + 1),
-            bonds: step_above(self.bonds),
+            structures: structures + 1,
+            atoms: step_above(of_all(self.atoms) + 1),
+            bonds: step_above(of_all(self.bonds)),
         }
     }
 }
@@ -52,6 +55,12 @@ mod tests {
             let size = step_above(n);
             prop_assert!(size >= n && 4 * size <= 5 * n + 4, "{n}: {size}");
             prop_assert_eq!(step_above(size), size);
+        }
+
+        #[test]
+        fn any_number_of_structures_has_the_shape_of_a_power_of_two(n in 1_usize..100, atoms in 1_usize..300, bonds in 0_usize..9000) {
+            let copies = |n: usize| Shape { structures: n, atoms: n * atoms, bonds: n * bonds }.padded();
+            prop_assert_eq!(copies(n), copies(n.next_power_of_two()));
         }
 
         #[test]

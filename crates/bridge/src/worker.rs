@@ -1,6 +1,6 @@
 //! The thread of a device: starts its server and tests the model.
 
-use std::collections::{HashMap, HashSet, VecDeque};
+use std::collections::{HashMap, VecDeque};
 use std::sync::mpsc::SyncSender;
 use std::time::Instant;
 
@@ -9,12 +9,12 @@ use tracing::info;
 use crate::batch_limit::LimitFile;
 use crate::description::{AdapterFeatures, ModelDescription};
 use crate::error::DeviceError;
-use crate::faults::Fault;
-use crate::running::{REFERENCE, Running};
+use crate::faults::ServerFault;
 use crate::same_model::ModelReference;
 use crate::schedule::Schedule;
 use crate::self_test::{self, SelfTestReport, TestSubject};
 use crate::server::{Server, Synchronous};
+use crate::server_loop::{REFERENCE, ServerLoop};
 use crate::setup::DeviceSetup;
 
 /// What a device tells of itself when it is ready.
@@ -52,7 +52,7 @@ pub(crate) fn run(
 fn begin<'a>(
     setup: &'a DeviceSetup,
     progress: &'a dyn Fn(&str),
-) -> Result<(Running<'a>, DeviceInfo), DeviceError> {
+) -> Result<(ServerLoop<'a>, DeviceInfo), DeviceError> {
     // No walker knows the device before it has started.
     let early = &mut Vec::new();
     progress(&format!("starting {}", setup.settings.names()));
@@ -73,44 +73,46 @@ fn begin<'a>(
     progress("testing the derivatives of the model");
     let names = || setup.settings.names();
     let refused = |source| DeviceError::SelfTest { names: names(), source };
-    let reference = self_test::reference(&subject).map_err(|error| refused(error.into()))?;
+    let test_structure = self_test::reference(&subject).map_err(|error| refused(error.into()))?;
     let mut calls = Synchronous { server: &mut server, setup, early, fault: None };
     let tested = self_test::run(&subject, &mut calls);
     if let Some(fault) = calls.fault.take() {
         return Err(start_error(server.end(fault)));
     }
     let report = tested.map_err(refused)?;
-    let found = calls.round_trip(&[&reference], None).map_err(start_error)?;
+    let found = calls.round_trip(0, &[&test_structure], None).map_err(start_error)?;
     let energies = found.into_iter().next().map(|one| one.energies).unwrap_or_default();
     let limit = description.max_structures.unwrap_or(u32::MAX).min(setup.settings.max_batch.get());
     let limit_file = LimitFile::new(&setup.settings, &description);
-    let mut running = Running {
+    let reference = ModelReference { description, energies };
+    let mut running = ServerLoop {
         setup,
         progress,
         server: Some(server),
         generation: 0,
-        identity: description.identity.clone(),
-        reference: (reference, energies.clone()),
-        schedule: Schedule::new(limit as usize),
+        test_structure,
+        reference: reference.clone(),
+        schedule: Schedule::new(limit as usize, reference.description.padding),
         limit_file,
         clients: HashMap::new(),
         calls: HashMap::new(),
         sent: VecDeque::new(),
         suspects: Vec::new(),
-        interrupted: HashSet::new(),
+        crashes: HashMap::new(),
         failures: 0,
+        refusals: 0,
         next_id: REFERENCE + 1,
         busy_since: None,
         started: Instant::now(),
         given_up: None,
     };
     running.use_kept_limit();
-    Ok((running, DeviceInfo { reference: ModelReference { description, energies }, self_test: report }))
+    Ok((running, DeviceInfo { reference, self_test: report }))
 }
 
-fn start_error(fault: Fault) -> DeviceError {
+fn start_error(fault: ServerFault) -> DeviceError {
     match fault {
-        Fault::Stopped => DeviceError::Stopped,
+        ServerFault::Stopped => DeviceError::Stopped,
         other => DeviceError::Server(other.message().to_owned()),
     }
 }

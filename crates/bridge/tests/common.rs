@@ -47,7 +47,7 @@ impl Fixture {
 
     /// Starts the device.
     pub fn device(&self) -> Result<Arc<Device>, DeviceError> {
-        Device::start(self.settings.clone(), &CancellationToken::new(), |_| {}).map(Arc::new)
+        Device::start(self.settings.clone(), true, &CancellationToken::new(), |_| {}).map(Arc::new)
     }
 
     /// Its model, with projected features.

@@ -1,6 +1,7 @@
 //! Servers that fail.
 
-use std::sync::mpsc;
+use std::num::NonZeroU32;
+use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
 use atoms::{Evaluation, NeighbourList, PotentialError};
@@ -36,6 +37,50 @@ fn faults_change_no_result() {
     assert_eq!(statistics.restarts, 6, "{statistics:?}");
 }
 
+/// A batch that is sent ahead has its whole time from the answer of the one before it.
+#[test]
+fn the_time_of_a_call_does_not_include_the_one_before_it() {
+    let mut fixture = Fixture::new(json!({}));
+    let control = fixture.control();
+    fixture.settings.options.insert("control".to_owned(), json!(control));
+    (fixture.settings.timeout, fixture.settings.max_batch) = (Duration::from_secs(1), NonZeroU32::MIN);
+    let device = fixture.device().unwrap();
+    let model = Fixture::model(&device);
+    let step = |k| drop(biased_step(&mut *model.clone().evaluator(Threads::default()), 1, k));
+    (0..2).for_each(step);
+    // Two such calls take longer than the time of one.
+    std::fs::write(&control, "base_seconds 0.6").unwrap();
+    std::thread::scope(|scope| {
+        (0..2).for_each(|k| drop(scope.spawn(move || step(k))));
+    });
+    let statistics = device.statistics();
+    assert!(statistics.restarts == 0 && statistics.computed > 2.4, "{statistics:?}");
+}
+
+/// A framework that does not compile for shapes has no more time for a new number of bonds.
+#[test]
+fn another_number_of_bonds_is_no_new_program() {
+    let mut fixture = Fixture::new(json!({}));
+    let control = fixture.control();
+    fixture.settings.options.insert("control".to_owned(), json!(control));
+    fixture.settings.timeout = Duration::from_secs(1);
+    let device = fixture.device().unwrap();
+    let mut potential = Fixture::model(&device).evaluator(Threads::default());
+    let structure = crystal(2, 0);
+    let mut bonds = |skin| {
+        let mut list = NeighbourList::new(5.5, skin);
+        list.update(&structure).unwrap();
+        let before = device.statistics().bonds;
+        potential.forward(&structure, &list).unwrap();
+        device.statistics().bonds - before
+    };
+    let first = bonds(1.5);
+    std::fs::write(&control, "hang").unwrap();
+    assert_ne!(bonds(0.0), first);
+    let failure = device.statistics().last_failure.unwrap();
+    assert!(failure.contains("no answer for 1 s"), "{failure}");
+}
+
 /// A batch that is too large is halved, and results are the same.
 #[test]
 fn batches_fit_into_the_memory() {
@@ -66,7 +111,8 @@ fn the_size_of_batches_is_kept_for_the_next_start() {
     let start = |fixture: &Fixture| {
         let (sender, said) = mpsc::channel();
         let progress = move |text: &str| drop(sender.send(text.to_owned()));
-        let device = Device::start(fixture.settings.clone(), &CancellationToken::new(), progress).unwrap();
+        let device =
+            Device::start(fixture.settings.clone(), true, &CancellationToken::new(), progress).unwrap();
         let _ = std::fs::remove_file(&count);
         device.warm_up(&crystal(1, 0), 0.5, 32).unwrap();
         let calls = std::fs::read_to_string(&count).unwrap();
@@ -123,6 +169,100 @@ fn three_failures_in_a_row_end_a_device() {
     assert!(device.broken().is_cancelled());
 }
 
+/// A structure at which the server dies ends its own walk, not those that are evaluated beside it.
+#[test]
+fn a_structure_that_kills_the_server_is_refused() {
+    let fixture = Fixture::new(json!({ "exit_at_atoms": 32, "base_seconds": 0.02 }));
+    let device = fixture.device().unwrap();
+    let model = Fixture::model(&device);
+    let refused = |repeats| {
+        let mut potential = model.clone().evaluator(Threads::default());
+        let structure = crystal(repeats, 0);
+        let mut list = NeighbourList::new(potential.cutoff(), 0.5);
+        list.update(&structure).unwrap();
+        potential.evaluate(&structure, &list, &mut Evaluation::default()).unwrap_err()
+    };
+    std::thread::scope(|scope| {
+        let walks: Vec<_> = (0..3)
+            .map(|k| {
+                let mut potential = model.clone().evaluator(Threads::default());
+                scope.spawn(move || (0..20).for_each(|_| drop(biased_step(&mut *potential, 1, k))))
+            })
+            .collect();
+        let error = refused(2);
+        let PotentialError::Failed(reason) = error else { panic!("{error:?}") };
+        assert!(
+            reason.contains("3 times at this structure") && reason.contains("exit status: 3"),
+            "{reason}"
+        );
+        walks.into_iter().for_each(|walk| walk.join().unwrap());
+    });
+    assert!(!device.broken().is_cancelled());
+    assert_eq!(device.statistics().restarts, 3);
+    // If it dies at every structure, it is broken.
+    assert!(matches!(refused(2), PotentialError::Failed(_)));
+    assert!(matches!(refused(2), PotentialError::Failed(_)));
+    assert!(matches!(refused(2), PotentialError::Failed(_)));
+    assert!(matches!(refused(1), PotentialError::Unavailable(_)));
+    assert!(device.broken().is_cancelled());
+}
+
+/// An adapter whose program exits when it is told to, and whose energies depend on a file.
+const DRIFT: &str = "
+import os
+from pathlib import Path
+
+from calmwalk.adapters.radial import Radial
+
+HERE = Path(__file__).parent
+
+
+class Drift(Radial):
+    def __init__(self, **settings):
+        super().__init__(**settings)
+        self.drift = float((HERE / 'drift').read_text())
+
+    def evaluate(self, batch, features):
+        if (HERE / 'exit').exists():
+            (HERE / 'exit').unlink()
+            os._exit(3)
+        result = super().evaluate(batch, features)
+        result.energies = result.energies + self.drift
+        return result
+";
+
+/// A server that is started again must have the same results; where it matters, the same bits.
+#[test]
+fn a_server_that_has_changed_meanwhile_is_refused() {
+    for (drift, same_bits, expected) in [
+        ("1e-13", true, Some("other bits")),
+        ("1e-13", false, None),
+        ("0.01", false, Some("energy of the test structure")),
+    ] {
+        let mut fixture = Fixture::new(json!({}));
+        let file = |name: &str| fixture.directory.path().join(name);
+        std::fs::write(file("drift.py"), DRIFT).unwrap();
+        std::fs::write(file("drift"), "0.0").unwrap();
+        fixture.settings.adapter = format!("{}:Drift", file("drift.py").display());
+        let device = Device::start(fixture.settings.clone(), same_bits, &CancellationToken::new(), |_| {})
+            .map(Arc::new);
+        let device = device.unwrap();
+        let mut potential = Fixture::model(&device).evaluator(Threads::default());
+        let structure = crystal(1, 0);
+        let mut list = NeighbourList::new(potential.cutoff(), 0.5);
+        list.update(&structure).unwrap();
+        std::fs::write(file("drift"), drift).unwrap();
+        std::fs::write(file("exit"), "").unwrap();
+        let result = potential.evaluate(&structure, &list, &mut Evaluation::default());
+        let reason = result.err().map(|error| error.to_string()).unwrap_or_default();
+        assert!(reason.contains(expected.unwrap_or_default()), "{drift}: {reason}");
+        assert_eq!(
+            (reason.is_empty(), device.broken().is_cancelled()),
+            (expected.is_none(), expected.is_some())
+        );
+    }
+}
+
 /// Models that are wrong are refused with the figures, and servers that do not start with what is missing.
 #[test]
 fn wrong_models_and_environments_are_refused() {
@@ -156,4 +296,12 @@ fn models_that_are_not_reproducible_are_known() {
     let crowded = Fixture::new(json!({ "crowd": 1e-13 })).device().unwrap();
     let report = &crowded.info().self_test;
     assert!(report.is_deterministic && !report.is_batch_independent);
+    let pulled = Fixture::new(json!({ "crowd_gradients": 1e-13 })).device().unwrap();
+    assert!(!pulled.info().self_test.is_batch_independent);
+    // Some depend on it in large batches only.
+    for (crowd, most, are_same) in [("crowd", 4, true), ("crowd", 8, false), ("crowd_gradients", 8, false)] {
+        let large = Fixture::new(json!({ crowd: 1e-13, "crowd_above": 4 })).device().unwrap();
+        assert!(large.info().self_test.is_batch_independent);
+        assert_eq!(large.warm_up(&crystal(1, 0), 0.5, most), Ok(are_same), "{crowd} {most}");
+    }
 }

@@ -72,6 +72,18 @@ fn batches_change_nothing() {
     assert!(device.statistics().largest_batch > 1);
 }
 
+/// A launcher's words, such as a container's image, are relative to the working directory; the program behind it is left as it is.
+#[test]
+fn a_launcher_starts_the_program() {
+    let mut fixture = Fixture::new(json!({}));
+    let environment = fixture.settings.environment.clone();
+    let directory = environment.parent().unwrap().display();
+    let path = format!("PATH={directory}:{}", std::env::var("PATH").unwrap());
+    fixture.settings.launcher = ["sh", "tests/launcher.sh", "env", &path].map(str::to_owned).to_vec();
+    fixture.settings.environment = environment.file_name().unwrap().into();
+    fixture.device().unwrap();
+}
+
 /// Padding and compiled programs.
 #[test]
 fn padding_changes_nothing() {

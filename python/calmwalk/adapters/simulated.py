@@ -11,16 +11,18 @@ Options, all with a default that does nothing:
 - `max_structures`: what hello reports
 - `memory_above`: a call with more structures than this is out of memory
 - `fault`, `fault_call`, `fault_at`: a fault at the n-th call (from 1) of a kind: hello, evaluate (default) or pull_back
+- `exit_at_atoms`: the process ends with status 3 at a call with a structure of so many atoms
 - `control`: path of a file, looked for at each evaluate and pull_back. It has a fault a line; it is removed when it
-  is read, and its faults happen at this and the next calls, one at each. "memory_above 8" sets that option and is not
-  a fault.
+  is read, and its faults happen at this and the next calls, one at each. "memory_above 8" and "base_seconds 0.5" set
+  these options and are no faults.
 - `count`: path of a file to which each call appends a line: kind, structures, atoms, bonds (with padding), real
   structures
 - `bend`: {"forces": 1.1, …} multiplies a result (forces, virials, gradients, gradient_virials) by a factor: a model
   with wrong derivatives
 - `noise`: relative noise of the energies, another in each call: a model that is not deterministic
 - `order`: energies differ by this times the atom's index: a model that permutations change
-- `crowd`: energies differ by this times the number of structures: a model that the composition of a batch changes
+- `crowd`, `crowd_gradients`: energies, or gradients, differ by this times the number of structures beyond
+  `crowd_above`: a model that the composition of a batch changes
 
 Faults: "exit" (the process ends with status 3), "hang" (sleeps without end), "slow" (ten seconds more), "nan" (the
 first force, or gradient, is not a number), "shape" (forces, or gradients, of one atom less), "type" (of whole
@@ -56,12 +58,15 @@ _DEFAULTS: dict[str, Any] = {
     "fault": None,
     "fault_call": "evaluate",
     "fault_at": 1,
+    "exit_at_atoms": None,
     "control": None,
     "count": None,
     "bend": {},
     "noise": 0.0,
     "order": 0.0,
     "crowd": 0.0,
+    "crowd_gradients": 0.0,
+    "crowd_above": 0,
 }
 
 
@@ -114,6 +119,8 @@ class Simulated:
         result = self._radial.pull_back(batch, feature_cotangents, energy_cotangents)
         bend = self._options["bend"]
         result.gradients = _spoil(fault, result.gradients * bend.get("gradients", 1.0))
+        if self._options["crowd_gradients"] and self._crowd(batch):
+            result.gradients = result.gradients + self._options["crowd_gradients"] * self._crowd(batch)
         result.virials = result.virials * bend.get("gradient_virials", 1.0)
         result.compiled = compiled
         self._end(started, batch, compiled)
@@ -123,6 +130,8 @@ class Simulated:
         """The fault of a call that its result shows, and whether its shape is new."""
         self._note(call, batch)
         fault = self._strike(call)
+        if self._options["exit_at_atoms"] in np.bincount(batch.structure_of_atom):
+            os._exit(3)
         limit = self._options["memory_above"]
         if limit is not None and batch.real.structures > limit:
             raise MemoryError(f"{batch.real.structures} structures in a batch, room for {limit}")
@@ -166,6 +175,8 @@ class Simulated:
             name, _, value = line.partition(" ")
             if name == "memory_above":
                 self._options[name] = int(value) if value else None
+            elif name == "base_seconds":
+                self._options[name] = float(value)
             elif name in FAULTS:
                 self._pending.append(name)
             else:
@@ -184,8 +195,11 @@ class Simulated:
         if options["order"]:
             energies = energies + options["order"] * np.arange(len(energies))
         if options["crowd"]:
-            energies = energies + options["crowd"] * batch.n_structures
+            energies = energies + options["crowd"] * self._crowd(batch)
         return energies
+
+    def _crowd(self, batch: Batch) -> int:
+        return max(0, batch.n_structures - self._options["crowd_above"])
 
 
 def _happen(fault: str) -> None:

@@ -1,6 +1,6 @@
 //! What a campaign needs of a machine.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use workers::labeller::BatchSystem;
 
@@ -52,9 +52,9 @@ impl Requirements {
         Some(forecast.bytes() + forecast.declined + disk_forecast::WAL_BYTES)
     }
 
-    /// The Python environment of its potential.
-    pub fn python(&self) -> Option<PathBuf> {
-        self.config.potential.python.as_ref().map(|python| python.environment.clone())
+    /// The launcher and the Python environment of its potential.
+    pub fn python(&self) -> Option<(&[String], &Path)> {
+        self.config.potential.python.as_ref().map(|python| (&python.launcher[..], &*python.environment))
     }
 
     /// Whether its labels are jobs of Slurm.

@@ -6,34 +6,51 @@ use std::path::{Path, PathBuf};
 use atoms::{Potential, extxyz::Frame, read_structures};
 use calm::rules::Positive;
 use md::ThermostatSettings;
+use potentials::grace::Threads;
 use serde::Deserialize;
+use serde::de::DeserializeOwned;
 use toml::Spanned;
 
+use crate::cli::CommandError;
 use crate::config::{
-    ConfigError, Document, KnownKeys, PotentialConfig, location_of_offset, read_text, wrong_thermostat,
+    ConfigError, Document, KnownKeys, PotentialConfig, PotentialSection, PythonSection, location_of_offset,
+    read_text, wrong_thermostat,
 };
+use crate::loaded_model::LoadedModel;
 use crate::output::log_and_warn;
 
 /// Placeholder values for invalid required keys, so that the other keys can be checked too.
 const PLACEHOLDERS: &str = r#"
 structure = "-"
-potential = { kind = "grace", file = "-" }
 dynamics = { steps = 0, temperature = 300.0, thermostat = { none = {} } }
 output = { trajectory = "-" }
 "#;
 
+/// Placeholders of the two forms of `[potential]`.
+const POTENTIAL_FILE: &str = "potential = { kind = \"grace\", file = \"-\" }";
+const POTENTIAL_MODEL: &str = "potential = { model = \"-\" }";
+
 /// The file. Input paths are relative to its directory, output paths to the working directory.
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug)]
 pub struct MdConfig {
     /// The dynamics starts from the first frame of this file.
     pub structure: Spanned<PathBuf>,
-    /// The potential.
-    pub potential: PotentialConfig,
+    /// File of the potential.
+    pub potential: Spanned<PathBuf>,
     /// Integration.
     pub dynamics: DynamicsSection,
     /// Output files.
     pub output: OutputSection,
+}
+
+/// The file as it stands, with one form of `[potential]`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct MdFile<P> {
+    structure: Spanned<PathBuf>,
+    potential: P,
+    dynamics: DynamicsSection,
+    output: OutputSection,
 }
 
 /// `[dynamics]`
@@ -70,34 +87,31 @@ pub struct OutputSection {
 }
 
 impl MdConfig {
-    /// Reads and checks the configuration, its structure and its potential.
-    pub fn load(path: &Path) -> Result<(Self, Frame, Box<dyn Potential>), ConfigError> {
+    /// Reads and checks the configuration, its structure and its potential. The program of a model in Python is started.
+    pub fn load(path: &Path) -> Result<(Self, Frame, Box<dyn Potential>), CommandError> {
         let text = read_text(path)?;
-        let mut document = Document::parse(path, &text)?;
+        let document = Document::parse(path, &text)?;
         let known = KnownKeys::new().with::<DynamicsSection>("dynamics").with::<OutputSection>("output");
-        let config: Option<Self> = document.read(PLACEHOLDERS, &known);
-        let warnings = document.check_ranges("dynamics");
-        document.check_rules(|| {
-            let thermostat = config.as_ref().map(|config| config.dynamics.thermostat);
-            thermostat.and_then(|it| wrong_thermostat(&it, "dynamics")).into_iter().collect()
-        });
-        document.finish()?;
-        warnings.iter().for_each(log_and_warn);
-        let mut config = config.ok_or_else(|| ConfigError::unreadable(path))?;
-        let directory = path.parent().unwrap_or(Path::new(""));
-        for file in [&mut config.structure, &mut config.potential.file] {
-            *file.get_mut() = directory.join(file.get_ref());
-        }
-        let wrong = |key: &str, file: &Spanned<PathBuf>, message: String| ConfigError::File {
-            at: location_of_offset(path, &text, file.span().start),
-            key: key.to_owned(),
-            message,
+        let (config, potential) = if document.has("potential", "model") {
+            let known = known.with::<PotentialSection>("potential").with::<PythonSection>("potential.python");
+            let file: MdFile<PotentialSection> = read(path, document, POTENTIAL_MODEL, &known)?;
+            let model = LoadedModel::from_configuration(path)?.shared();
+            (
+                file.with_potential(|section| section.model),
+                model.evaluator(Threads::default()) as Box<dyn Potential>,
+            )
+        } else {
+            let mut file: MdFile<PotentialConfig> = read(path, document, POTENTIAL_FILE, &known)?;
+            let potential_file = file.potential.file.get_mut();
+            *potential_file = beside(path, potential_file);
+            let wrong = |error| wrong_file(path, &text, "potential.file", &file.potential.file, error);
+            let potential = file.potential.load().map_err(wrong)?;
+            (file.with_potential(|potential| potential.file), potential)
         };
-        let potential_file = &config.potential.file;
-        let potential =
-            config.potential.load().map_err(|error| wrong("potential.file", potential_file, error))?;
-        let start =
-            config.start(&*potential).map_err(|error| wrong("structure", &config.structure, error))?;
+        let mut config = config;
+        *config.structure.get_mut() = beside(path, config.structure.get_ref());
+        let start = config.start(&*potential);
+        let start = start.map_err(|error| wrong_file(path, &text, "structure", &config.structure, error))?;
         Ok((config, start, potential))
     }
 
@@ -120,6 +134,40 @@ impl MdConfig {
         }
         Ok(start)
     }
+}
+
+impl<P> MdFile<P> {
+    fn with_potential(self, file: impl Fn(P) -> Spanned<PathBuf>) -> MdConfig {
+        let Self { structure, potential, dynamics, output } = self;
+        MdConfig { structure, potential: file(potential), dynamics, output }
+    }
+}
+
+/// Reads one form of the file, with the placeholders of its potential.
+fn read<P: DeserializeOwned>(
+    path: &Path,
+    mut document: Document<'_>,
+    potential: &str,
+    known: &KnownKeys,
+) -> Result<MdFile<P>, ConfigError> {
+    let config: Option<MdFile<P>> = document.read(&format!("{PLACEHOLDERS}{potential}\n"), known);
+    let warnings = document.check_ranges("dynamics");
+    document.check_rules(|| {
+        let thermostat = config.as_ref().map(|config| config.dynamics.thermostat);
+        thermostat.and_then(|it| wrong_thermostat(&it, "dynamics")).into_iter().collect()
+    });
+    document.finish()?;
+    warnings.iter().for_each(log_and_warn);
+    config.ok_or_else(|| ConfigError::unreadable(path))
+}
+
+/// A path relative to the directory of the configuration.
+fn beside(configuration: &Path, file: &Path) -> PathBuf {
+    configuration.parent().unwrap_or(Path::new("")).join(file)
+}
+
+fn wrong_file(path: &Path, text: &str, key: &str, file: &Spanned<PathBuf>, message: String) -> ConfigError {
+    ConfigError::File { at: location_of_offset(path, text, file.span().start), key: key.to_owned(), message }
 }
 
 fn one() -> u64 {

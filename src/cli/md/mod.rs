@@ -41,7 +41,7 @@ impl MdArgs {
         let inputs = [
             (self.config.as_path(), "the configuration"),
             (config.structure.get_ref().as_path(), "the structure to start from"),
-            (config.potential.file.get_ref().as_path(), "the potential"),
+            (config.potential.get_ref().as_path(), "the potential"),
         ];
         refuse_to_replace(&path, inputs)?;
         let state = initial_state(&config.dynamics, start.structure);

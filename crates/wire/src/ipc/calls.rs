@@ -24,7 +24,7 @@ const ACTIVE: usize = 2;
 /// As [`super::config`] explains.
 const CHANNELS: usize = 2 * ACTIVE + 1;
 /// Interval at which a waiting end looks around, in case an event was lost.
-const LOOK_AROUND: Duration = Duration::from_millis(500);
+const POLL_INTERVAL: Duration = Duration::from_millis(500);
 /// How long an answer may take after the client was asked to stop.
 const STOPPING_TIMEOUT: Duration = Duration::from_secs(10);
 /// The first word of a request: who asks.
@@ -119,7 +119,7 @@ impl CallServer {
     ) -> Result<(), IpcError> {
         while !stop.is_cancelled() {
             // A signal may end the wait early.
-            let _ = self.wakeup.timed_wait(|_| {}, LOOK_AROUND);
+            let _ = self.wakeup.timed_wait(|_| {}, POLL_INTERVAL);
             while let Ok(Some(request)) = self.port.receive() {
                 let Some(client) = request.payload().first().copied() else { continue };
                 // A client that has died meanwhile has no events.
@@ -254,7 +254,7 @@ impl CallClient {
             {
                 return Ok(None);
             }
-            let _ = self.wakeup.timed_wait(|_| {}, LOOK_AROUND);
+            let _ = self.wakeup.timed_wait(|_| {}, POLL_INTERVAL);
         }
     }
 }

@@ -1,23 +1,22 @@
 //! The thread of a device while its server runs: takes calls, sends batches, and hands out results.
 
-use std::collections::{HashMap, HashSet, VecDeque};
+use std::collections::{HashMap, VecDeque};
 use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
-use tracing::{info, warn};
+use tracing::warn;
 
 use crate::batch_limit::LimitFile;
 use crate::call::{BondGeometry, Call};
-use crate::description::AdapterFeatures;
 use crate::error::CallError;
 use crate::events::DeviceEvent;
-use crate::faults::Fault;
+use crate::faults::ServerFault;
 use crate::process::ServerEvent;
 use crate::recipient::Recipient;
-use crate::schedule::{DeviceBatch, Kind, Next, Schedule, Ticket};
-use crate::server::{Outstanding, Server, Synchronous};
+use crate::same_model::ModelReference;
+use crate::schedule::{DeviceBatch, NextBatch, Schedule, Ticket, TicketKind};
+use crate::server::{Outstanding, Server};
 use crate::setup::DeviceSetup;
-use crate::shapes::Shape;
 
 /// The call of the reference structure.
 pub(crate) const REFERENCE: u64 = 0;
@@ -27,12 +26,12 @@ const IDLE: Duration = Duration::from_secs(3600);
 /// A call without result.
 pub(crate) struct PendingCall {
     pub client: u64,
-    pub work: Work,
+    pub work: CallKind,
     pub recipient: Recipient,
 }
 
 /// What a call asks for.
-pub(crate) enum Work {
+pub(crate) enum CallKind {
     Evaluate { geometry: BondGeometry, features: bool },
     PullBack { cotangent: Vec<f64> },
 }
@@ -44,19 +43,20 @@ pub(crate) struct SentBatch {
 }
 
 /// A result that is nonsense, until the reference structure tells whether that is the server's fault.
-pub(crate) struct Suspect {
+pub(crate) struct SuspectResult {
     pub ticket: Ticket,
     pub outcome: Result<Vec<f64>, String>,
 }
 
 /// The thread while its server runs.
-pub(crate) struct Running<'a> {
+pub(crate) struct ServerLoop<'a> {
     pub setup: &'a DeviceSetup,
     pub progress: &'a dyn Fn(&str),
     pub server: Option<Server>,
     pub generation: u64,
-    pub identity: String,
-    pub reference: (BondGeometry, Vec<f64>),
+    pub test_structure: BondGeometry,
+    /// The model, and what it gave for the test structure at the start.
+    pub reference: ModelReference,
     pub schedule: Schedule,
     /// Keeps the size of batches for the next start.
     pub limit_file: Option<LimitFile>,
@@ -64,22 +64,25 @@ pub(crate) struct Running<'a> {
     pub clients: HashMap<u64, BondGeometry>,
     pub calls: HashMap<u64, PendingCall>,
     pub sent: VecDeque<SentBatch>,
-    pub suspects: Vec<Suspect>,
-    /// Calls that a failure has interrupted.
-    pub interrupted: HashSet<u64>,
+    pub suspects: Vec<SuspectResult>,
+    /// How often the server has failed at each call that has no result yet.
+    pub crashes: HashMap<u64, u32>,
+    /// Failures of the server since its last answer to a client.
     pub failures: u32,
+    /// Calls that were refused since then because the server failed at them.
+    pub refusals: u32,
     pub next_id: u64,
     pub busy_since: Option<Instant>,
     pub started: Instant,
     pub given_up: Option<String>,
 }
 
-impl Running<'_> {
+impl ServerLoop<'_> {
     /// Works until the device is closed.
     pub fn run(&mut self) {
         loop {
             let next = self.dispatch();
-            let deadline = self.sent.front().map(|sent| sent.call.deadline);
+            let deadline = self.sent.front().map(|sent| sent.call.deadline());
             let until = [next, deadline].into_iter().flatten().min();
             let timeout = until.map_or(IDLE, |until| until.saturating_duration_since(Instant::now()));
             let is_open = match self.setup.incoming.recv_timeout(timeout) {
@@ -107,13 +110,13 @@ impl Running<'_> {
                     ServerEvent::Line(line) => self.take_answer(&line),
                     ServerEvent::Ended => {
                         let names = self.setup.settings.names();
-                        self.restart(Fault::Exited(format!("{names}: the server has exited")));
+                        let batch = self.take_oldest();
+                        self.restart(ServerFault::Exited(format!("{names}: the server has exited")), batch);
                     }
                 }
             }
             DeviceEvent::WarmUp { geometry, most, done } => {
-                self.warm_up(&geometry, most);
-                let _ = done.send(());
+                let _ = done.send(self.warm_up(&geometry, most));
             }
             DeviceEvent::Close => return false,
         }
@@ -127,11 +130,11 @@ impl Running<'_> {
         let known = self.clients.get(&client).map(BondGeometry::shape);
         let accepted = call.and_then(|call| match call {
             Call::Evaluate { geometry, features, pull_back_follows } => {
-                let kind = Kind::Evaluate { follows: pull_back_follows, features };
-                Ok((geometry.shape(), kind, Work::Evaluate { geometry, features }))
+                let kind = TicketKind::Evaluate { follows: pull_back_follows, features };
+                Ok((geometry.shape(), kind, CallKind::Evaluate { geometry, features }))
             }
             Call::PullBack { cotangent } => match known {
-                Some(shape) => Ok((shape, Kind::PullBack, Work::PullBack { cotangent })),
+                Some(shape) => Ok((shape, TicketKind::PullBack, CallKind::PullBack { cotangent })),
                 None => Err("a pull-back before the first evaluation".to_owned()),
             },
         });
@@ -150,9 +153,9 @@ impl Running<'_> {
     fn dispatch(&mut self) -> Option<Instant> {
         while self.server.is_some() {
             match self.schedule.next(Instant::now()) {
-                Next::Send(batch) => self.send(batch),
-                Next::WaitUntil(time) => return Some(time),
-                Next::Wait => return None,
+                NextBatch::Send(batch) => self.send(batch),
+                NextBatch::WaitUntil(time) => return Some(time),
+                NextBatch::Wait => return None,
             }
         }
         None
@@ -167,6 +170,13 @@ impl Running<'_> {
                 self.busy_since.get_or_insert(now);
                 self.setup.note(|statistics| statistics.waited += waited);
             }
+            // It exited when it was idle, or while it computed the batch before.
+            Err(fault @ ServerFault::Exited(_)) => {
+                self.schedule.abort_newest();
+                self.schedule.put_back(batch.tickets());
+                let before = self.take_oldest();
+                self.restart(fault, before);
+            }
             Err(fault) => {
                 self.schedule.abort_newest();
                 self.handle_fault(fault, batch);
@@ -174,22 +184,27 @@ impl Running<'_> {
         }
     }
 
-    fn write_and_send(&mut self, batch: &DeviceBatch) -> Result<Outstanding, Fault> {
-        let Self { server, calls, clients, reference, setup, .. } = self;
-        let server = server.as_mut().ok_or(Fault::Stopped)?;
+    /// The calls that the server is working on.
+    fn take_oldest(&mut self) -> Vec<Ticket> {
+        self.sent.pop_front().map(|sent| sent.batch.tickets()).unwrap_or_default()
+    }
+
+    fn write_and_send(&mut self, batch: &DeviceBatch) -> Result<Outstanding, ServerFault> {
+        let Self { server, calls, clients, test_structure, setup, .. } = self;
+        let server = server.as_mut().ok_or(ServerFault::Stopped)?;
         let settings = &setup.settings;
         let geometry = |ticket: &Ticket| match calls.get(&ticket.id).map(|call| &call.work) {
-            Some(Work::Evaluate { geometry, .. }) => geometry,
-            _ => clients.get(&ticket.client).unwrap_or(&reference.0),
+            Some(CallKind::Evaluate { geometry, .. }) => geometry,
+            _ => clients.get(&ticket.client).unwrap_or(test_structure),
         };
         let cotangent = |ticket: &Ticket| match calls.get(&ticket.id).map(|call| &call.work) {
-            Some(Work::PullBack { cotangent }) => Some(&cotangent[..]),
+            Some(CallKind::PullBack { cotangent }) => Some(&cotangent[..]),
             _ => None,
         };
         match batch {
             DeviceBatch::Evaluate { slot, tickets } => {
                 server.write(*slot, &tickets.iter().map(geometry).collect::<Vec<_>>())?;
-                let wants = |one: &Ticket| matches!(one.kind, Kind::Evaluate { features: true, .. });
+                let wants = |one: &Ticket| matches!(one.kind, TicketKind::Evaluate { features: true, .. });
                 server.send(*slot, Some(tickets.iter().any(wants)), settings)
             }
             DeviceBatch::PullBackKept { slot, tickets } => {
@@ -208,13 +223,17 @@ impl Running<'_> {
     fn take_answer(&mut self, line: &str) {
         let names = self.setup.settings.names();
         let Some(SentBatch { call, batch }) = self.sent.pop_front() else {
-            return self.restart(Fault::Nonsense(format!("{names}: an answer without a call")));
+            let fault = ServerFault::Nonsense(format!("{names}: an answer without a call"));
+            return self.restart(fault, Vec::new());
         };
+        let now = Instant::now();
+        if let Some(next) = self.sent.front_mut() {
+            next.call.begun = now;
+        }
         let Some(server) = &mut self.server else { return };
         match server.answer(line, &call, &names) {
             Ok((compiled, seconds)) => {
-                let now = Instant::now();
-                self.schedule.done(now);
+                self.schedule.done(now, now.duration_since(call.begun));
                 self.setup.note(|statistics| statistics.computed += seconds);
                 self.count(&call, &batch, compiled, now);
                 self.deliver(&call, &batch);
@@ -240,10 +259,10 @@ impl Running<'_> {
             let mut parts = server.arenas[call.slot].result(place, call.kind);
             if ticket.id == REFERENCE {
                 let energies = parts.energies.to_vec();
-                self.judge(&energies);
+                self.check_reference(&energies);
                 continue;
             }
-            if let Some(Work::Evaluate { features: false, .. }) =
+            if let Some(CallKind::Evaluate { features: false, .. }) =
                 self.calls.get(&ticket.id).map(|call| &call.work)
             {
                 parts.features = &[];
@@ -255,83 +274,31 @@ impl Running<'_> {
                 self.suspect(ticket, Ok(numbers));
                 continue;
             }
-            self.interrupted.remove(&ticket.id);
+            self.crashes.remove(&ticket.id);
+            (self.failures, self.refusals) = (0, 0);
             if let Some(call) = self.calls.remove(&ticket.id) {
                 call.recipient.answer(parts.len(), |out| parts.write(out));
-                if let Work::Evaluate { geometry, .. } = call.work {
+                if let CallKind::Evaluate { geometry, .. } = call.work {
                     self.clients.insert(call.client, geometry);
                 }
             }
         }
-        if self.interrupted.is_empty() && self.suspects.is_empty() {
-            self.failures = 0;
-        }
     }
 
     fn check_deadline(&mut self) {
-        let is_over = |sent: &SentBatch| sent.call.deadline <= Instant::now();
+        let is_over = |sent: &SentBatch| sent.call.deadline() <= Instant::now();
         if let Some(sent) = self.sent.front().filter(|sent| is_over(sent)) {
-            let seconds = (sent.call.deadline - sent.call.sent).as_secs();
+            let seconds = sent.call.timeout.as_secs();
             let names = self.setup.settings.names();
-            self.restart(Fault::Timeout(format!("{names}: no answer for {seconds} s")));
-        }
-    }
-
-    /// Evaluates batches of one, two, four … copies, so that their programs are compiled, and finds how many fit into the memory.
-    fn warm_up(&mut self, geometry: &BondGeometry, most: usize) {
-        let Some(server) = self.server.as_mut().filter(|_| self.sent.is_empty()) else { return };
-        let has_features = server.description.features.form != AdapterFeatures::None;
-        let dimension = if has_features { server.description.features.dimension } else { 0 };
-        let cotangent = vec![0.0; geometry.positions.len() * dimension];
-        let mut early = Vec::new();
-        let mut fault = None;
-        let mut copies = 1;
-        let Shape { bonds, .. } = geometry.shape();
-        let fits = |copies: usize, schedule: &Schedule| {
-            copies <= most.min(schedule.max_structures())
-                && (copies == 1 || copies * bonds <= schedule.max_bonds())
-        };
-        let mut found = None;
-        while fits(copies, &self.schedule) {
-            (self.progress)(&format!("preparing batches of {copies}"));
-            let structures = vec![geometry; copies];
-            let mut calls = Synchronous { server, setup: self.setup, early: &mut early, fault: None };
-            let made = calls.round_trip(&structures, None).and_then(|_| match has_features {
-                true => calls.round_trip(&structures, Some(&vec![&cotangent[..]; copies])).map(drop),
-                false => Ok(()),
-            });
-            match made {
-                Ok(()) => copies *= 2,
-                Err(short @ (Fault::Memory(_) | Fault::Arena(_))) if copies > 1 => {
-                    info!(
-                        message = short.message(),
-                        copies, "the memory of the device takes fewer structures"
-                    );
-                    found = Some((bonds * copies / 2, matches!(short, Fault::Memory(_))));
-                    break;
-                }
-                Err(other) => {
-                    fault = Some(other);
-                    break;
-                }
-            }
-        }
-        if let Some((bonds, is_device)) = found {
-            self.limit_bonds(bonds, is_device);
-        }
-        if let Some(fault) = fault {
-            self.restart(fault);
-        }
-        for event in early {
-            // A device that was closed meanwhile learns so again from its channel.
-            self.handle(event);
+            let batch = self.take_oldest();
+            self.restart(ServerFault::Timeout(format!("{names}: no answer for {seconds} s")), batch);
         }
     }
 
     fn count(&mut self, call: &Outstanding, batch: &DeviceBatch, compiled: bool, now: Instant) {
         let tickets = batch.tickets();
         let bonds: usize = tickets.iter().map(|one| one.shape.bonds).sum();
-        let seconds = now.duration_since(call.sent).as_secs_f64();
+        let seconds = now.duration_since(call.begun).as_secs_f64();
         self.setup.note(|statistics| {
             statistics.batches += 1;
             statistics.structures += tickets.len() as u64;

@@ -1,0 +1,89 @@
+//! Batches of copies of a structure, before walkers call: programs are compiled, the memory of the device becomes known, and so does
+//! whether bits depend on the size of the batch.
+
+use tracing::info;
+
+use crate::call::BondGeometry;
+use crate::description::AdapterFeatures;
+use crate::events::DeviceEvent;
+use crate::faults::ServerFault;
+use crate::schedule::SLOTS;
+use crate::self_test::{TestResult, random_numbers};
+use crate::server::Synchronous;
+use crate::server_loop::ServerLoop;
+
+/// The numbers of a structure in a batch: of its evaluation, and of its pull-back if the model has features.
+type Copied = [Option<TestResult>; 2];
+
+impl ServerLoop<'_> {
+    /// Evaluates batches of one, two, four … copies, at most `most`, and finds how many fit into the memory. Returns whether each copy
+    /// has the bits of the structure alone.
+    pub fn warm_up(&mut self, geometry: &BondGeometry, most: usize) -> bool {
+        if self.server.is_none() || !self.sent.is_empty() {
+            return true;
+        }
+        let mut early = Vec::new();
+        let bonds = geometry.shape().bonds;
+        let (mut copies, mut alone, mut are_same) = (1, None, true);
+        while copies <= most.min(self.schedule.max_structures())
+            && (copies == 1 || copies * bonds <= self.schedule.max_bonds())
+        {
+            (self.progress)(&format!("preparing batches of {copies}"));
+            match self.evaluate_copies(geometry, copies, &mut early) {
+                Ok(results) => {
+                    let first = alone.get_or_insert_with(|| results[0].clone());
+                    are_same &= results.iter().all(|one| one == first);
+                    copies *= 2;
+                }
+                Err(short @ (ServerFault::Memory(_) | ServerFault::Arena(_))) if copies > 1 => {
+                    info!(
+                        message = short.message(),
+                        copies, "the memory of the device takes fewer structures"
+                    );
+                    self.limit_bonds(bonds * copies / 2, matches!(short, ServerFault::Memory(_)));
+                    break;
+                }
+                Err(fault) => {
+                    self.restart(fault, Vec::new());
+                    break;
+                }
+            }
+        }
+        for event in early {
+            // A device that was closed meanwhile learns so again from its channel.
+            self.handle(event);
+        }
+        are_same
+    }
+
+    /// One batch in each slot: walkers have the device keep two evaluations at a time. Returns the results of all copies.
+    fn evaluate_copies(
+        &mut self,
+        geometry: &BondGeometry,
+        copies: usize,
+        early: &mut Vec<DeviceEvent>,
+    ) -> Result<Vec<Copied>, ServerFault> {
+        let Some(server) = self.server.as_mut() else { return Err(ServerFault::Stopped) };
+        let has_features = server.description.features.form != AdapterFeatures::None;
+        let dimension = if has_features { server.description.features.dimension } else { 0 };
+        let cotangent = random_numbers(geometry.positions.len() * dimension, 5);
+        let structures = vec![geometry; copies];
+        let cotangents = vec![&cotangent[..]; copies];
+        let mut all = Vec::new();
+        for slot in 0..SLOTS {
+            let mut calls =
+                Synchronous { server: &mut *server, setup: self.setup, early: &mut *early, fault: None };
+            let energies = calls.round_trip(slot, &structures, None)?;
+            let gradients = match has_features {
+                true => {
+                    calls.round_trip(slot, &structures, Some(&cotangents))?.into_iter().map(Some).collect()
+                }
+                false => vec![None; copies],
+            };
+            all.extend(
+                energies.into_iter().zip(gradients).map(|(energies, gradients)| [Some(energies), gradients]),
+            );
+        }
+        Ok(all)
+    }
+}

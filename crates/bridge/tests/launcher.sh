@@ -1,0 +1,2 @@
+# A launcher: runs the words after it.
+exec "$@"
