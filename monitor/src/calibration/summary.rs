@@ -63,7 +63,7 @@ pub struct CalibrationBin {
     pub level_in_force: f64,
     /// How often the bounds of this bin held.
     pub coverage: Option<CalibrationCoverage>,
-    /// Whether the bounds of this bin count for structures without a label, and not those of the other map.
+    /// Whether the bin has enough structures, and its bounds count for structures without a label, not those of the other map.
     pub in_use: bool,
 }
 
@@ -127,7 +127,7 @@ impl CalibrationMap {
                     structures,
                     unbounded: 0.0,
                 }),
-                in_use: is_in_use(index),
+                in_use: is_in_use(index) && window.is_sufficient(),
             }
         };
         let coverage = |RollingCoverage { share, structures, unbounded }| CalibrationCoverage {

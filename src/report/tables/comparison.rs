@@ -100,10 +100,11 @@ fn unpaired(pairs: &PairedErrors) -> PageTable {
         return table;
     }
     table.rows.extend(rows.map(|(name, number)| vec![text(name), count(number)]));
-    for (error, side, range) in wording::failure_ranges(pairs) {
-        table
-            .rows
-            .push(vec![text(format!("median of the {side} side between: {}", error.name)), text(range)]);
+    for (error, sides) in wording::failure_ranges(pairs) {
+        let row = |(side, range): (&str, String)| {
+            vec![text(format!("median of the {side} side between: {}", error.name)), text(range)]
+        };
+        table.rows.extend(sides.into_iter().map(row));
     }
     table
 }

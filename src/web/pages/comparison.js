@@ -50,9 +50,10 @@ function between([low, high], digits, factor) {
 
 /** What the errors of failed labels could change. */
 function ranges(pairs, errors) {
-  const lines = errors.filter(({ key }) => pairs[key].pairs > 0).flatMap(({ name, key, digits, factor }) => ["biased", "control"]
-    .map((side) => [side, pairs[key][`${side}_between`]]).filter(([, range]) => range)
-    .map(([side, range]) => `${name} ${side} ${between(range, digits, factor)}`));
+  const sides = ({ key, digits, factor }) => ["biased", "control"].map((side) => [side, pairs[key][`${side}_between`]])
+    .filter(([, range]) => range).map(([side, range]) => `${side} ${between(range, digits, factor)}`);
+  const lines = errors.filter(({ key }) => pairs[key].pairs > 0).map((error) => [error.name, sides(error)])
+    .filter(([, of]) => of.length > 0).map(([name, of]) => `${name} ${of.join(", ")}`);
   return lines.length > 0 && element("p", {}, `Medians over the pairs for any errors of failed labels: ${lines.join("; ")}.`);
 }
 
