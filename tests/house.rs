@@ -187,7 +187,7 @@ fn sources(paths: &[&str]) -> BTreeMap<PathBuf, String> {
     while let Some(path) = open.pop() {
         if path.is_dir() {
             open.extend(std::fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().path()));
-        } else if path.extension().is_some_and(|kind| kind == "rs") && !path.ends_with("tests.rs") {
+        } else if path.extension().is_some_and(|kind| kind == "rs") && !is_test(&path) {
             let text = std::fs::read_to_string(&path).unwrap();
             let text = text.split("#[cfg(test)]\nmod tests {").next().unwrap_or_default().to_owned();
             found.insert(path, text);
@@ -198,6 +198,12 @@ fn sources(paths: &[&str]) -> BTreeMap<PathBuf, String> {
         "{paths:?}"
     );
     found
+}
+
+/// Whether a source file is one of tests: `tests.rs`, or in a folder of that name.
+fn is_test(path: &Path) -> bool {
+    let inside = path.strip_prefix(root()).unwrap_or(path);
+    path.ends_with("tests.rs") || inside.components().any(|part| part.as_os_str() == "tests")
 }
 
 /// Functions of the store that begin a write transaction, directly or indirectly.

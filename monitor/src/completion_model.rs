@@ -1,7 +1,9 @@
 //! The probability that the calculation of a label completes, learned from the finished labels of a campaign.
 //!
 //! The model knows labels of one protocol, of structures from walks with one version of the potential: grades of different
-//! versions cannot be compared.
+//! versions cannot be compared. As long as a version has too few of its own, it learns from those of all versions, without γ.
+
+use std::collections::BTreeMap;
 
 use analysis::{ReliabilityDiagram, logistic_regression};
 use serde::Serialize;
@@ -21,7 +23,7 @@ pub const MIN_OF_EACH: usize = 3;
 const RIDGE_PENALTY: f64 = 1.0;
 
 /// Parts into which finished structures are divided to judge the model: each is predicted by a model of the others.
-const FOLDS: usize = 5;
+const PARTS: usize = 5;
 
 /// Number of bins of the reliability diagram.
 const RELIABILITY_BINS: usize = 10;
@@ -33,6 +35,19 @@ pub struct CompletionExample {
     pub predictors: CompletionPredictors,
     /// Whether it has a label; otherwise all attempts failed.
     pub completed: bool,
+    /// Index of the seed structure.
+    pub seed_structure: u32,
+    /// Number of the biased walk; for a control frame, of the one that its walk matches.
+    pub walk: u32,
+}
+
+/// The finished structures that a version learns from.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CompletionExamples {
+    /// Newest first.
+    pub examples: Vec<CompletionExample>,
+    /// Whether they are of all versions, and their γ_max is 1, so that nothing is learned from it.
+    pub of_all_versions: bool,
 }
 
 /// The model, and what it was learned from.
@@ -54,8 +69,7 @@ impl CompletionModel {
         if finished == 0 {
             return None;
         }
-        let is_enough = finished >= MIN_FINISHED && failed.min(finished - failed) >= MIN_OF_EACH;
-        let coefficients = is_enough.then(|| regression(examples)).flatten();
+        let coefficients = is_enough(examples).then(|| regression(examples)).flatten();
         let share = (finished - failed) as f64 / finished as f64;
         let coefficients = coefficients.unwrap_or_else(|| CompletionCoefficients::constant(share));
         Some(Self { coefficients, finished, failed })
@@ -65,6 +79,12 @@ impl CompletionModel {
     pub fn probability(&self, predictors: &CompletionPredictors) -> f64 {
         self.coefficients.probability(predictors)
     }
+}
+
+/// Whether there are enough for a regression.
+fn is_enough(examples: &[CompletionExample]) -> bool {
+    let completed = examples.iter().filter(|example| example.completed).count();
+    examples.len() >= MIN_FINISHED && completed.min(examples.len() - completed) >= MIN_OF_EACH
 }
 
 fn regression(examples: &[CompletionExample]) -> Option<CompletionCoefficients> {
@@ -81,38 +101,85 @@ fn regression(examples: &[CompletionExample]) -> Option<CompletionCoefficients> 
 
 /// How reliable the model is: predictions of finished structures by models that were learned from others.
 ///
-/// The structures are divided in the order in which they were found, every fifth into the same part. Nothing is predicted
-/// from parts in which nothing is finished.
+/// Frames of one walk resemble each other, and so do walks from one seed structure. The parts therefore consist of whole seed
+/// structures, or, with fewer than five, of whole walks, each biased walk with its control. A single walk predicts nothing.
 pub fn reliability(examples: &[CompletionExample]) -> ReliabilityDiagram {
     let mut diagram = ReliabilityDiagram::new(RELIABILITY_BINS);
-    for fold in 0..FOLDS {
-        let is_left_out = |place: usize| place % FOLDS == fold;
-        let others = examples.iter().enumerate().filter(|(place, _)| !is_left_out(*place));
-        let others: Vec<_> = others.map(|(_, example)| example.clone()).collect();
+    let parts = parts(examples);
+    for part in 0..PARTS {
+        let (own, others): (Vec<_>, Vec<_>) =
+            examples.iter().cloned().zip(&parts).partition(|(_, of)| **of == part);
+        let others: Vec<_> = others.into_iter().map(|(example, _)| example).collect();
         let Some(model) = CompletionModel::fit(&others) else { continue };
-        for (_, example) in examples.iter().enumerate().filter(|(place, _)| is_left_out(*place)) {
+        for (example, _) in own {
             diagram.add(model.probability(&example.predictors), example.completed);
         }
     }
     diagram
 }
 
-/// What a finished structure teaches; `None` for one that has no neighbour list.
-pub fn example_of(finished: &FinishedStructure) -> Option<CompletionExample> {
-    let FinishedStructure { gamma, relative_volume, structure, labelled, .. } = finished;
-    let predictors =
-        CompletionPredictors::of_structure(structure, gamma.unwrap_or(f64::NAN), *relative_volume).ok()?;
-    Some(CompletionExample { predictors, completed: *labelled })
+/// The part of each structure.
+fn parts(examples: &[CompletionExample]) -> Vec<usize> {
+    let numbered = |of: fn(&CompletionExample) -> u32| {
+        let mut numbers: BTreeMap<u32, usize> = examples.iter().map(|example| (of(example), 0)).collect();
+        numbers.values_mut().enumerate().for_each(|(place, number)| *number = place);
+        (numbers.len(), examples.iter().map(|example| numbers[&of(example)] % PARTS).collect::<Vec<_>>())
+    };
+    let (seed_structures, parts) = numbered(|example| example.seed_structure);
+    if seed_structures >= PARTS { parts } else { numbered(|example| example.walk).1 }
 }
 
-/// The finished structures of the store under `protocol` from walks with `version` of the potential: the newest, newest first.
+/// The finished structures of the store under `protocol` from walks with `version` of the potential (`None`: any), newest first.
+async fn examples_of(
+    store: &Store,
+    protocol: ContentHash,
+    version: Option<u32>,
+) -> Result<Vec<CompletionExample>, StoreError> {
+    let matched = store.matched_walks().await?;
+    let finished = store.finished_structures(protocol, version, MAX_FINISHED).await?;
+    let example = |finished: &FinishedStructure| {
+        let FinishedStructure { walk, seed_structure, gamma, relative_volume, structure, labelled, .. } =
+            finished;
+        // Without a neighbour list nothing is known.
+        let predictors =
+            CompletionPredictors::of_structure(structure, gamma.unwrap_or(f64::NAN), *relative_volume);
+        Some(CompletionExample {
+            predictors: predictors.ok()?,
+            completed: *labelled,
+            seed_structure: *seed_structure,
+            walk: matched.get(walk).copied().unwrap_or(*walk),
+        })
+    };
+    Ok(finished.iter().filter_map(example).collect())
+}
+
+/// What a version learns from: its own finished structures, or those of all versions without their grades, where only these are enough.
 pub async fn examples(
     store: &Store,
     protocol: ContentHash,
     version: u32,
-) -> Result<Vec<CompletionExample>, StoreError> {
-    let finished = store.finished_structures(protocol, version, MAX_FINISHED).await?;
-    Ok(finished.iter().filter_map(example_of).collect())
+) -> Result<CompletionExamples, StoreError> {
+    let own = examples_of(store, protocol, Some(version)).await?;
+    match is_enough(&own) {
+        true => Ok(CompletionExamples { examples: own, of_all_versions: false }),
+        false => with_other_versions(store, protocol, own).await,
+    }
+}
+
+/// These examples of one version; those of all versions without their grades, if only these are enough.
+pub(crate) async fn with_other_versions(
+    store: &Store,
+    protocol: ContentHash,
+    own: Vec<CompletionExample>,
+) -> Result<CompletionExamples, StoreError> {
+    if !is_enough(&own) && !store.walk_versions().await?.is_single() {
+        let mut examples = examples_of(store, protocol, None).await?;
+        if is_enough(&examples) {
+            examples.iter_mut().for_each(|example| example.predictors.gamma_max = 1.0);
+            return Ok(CompletionExamples { examples, of_all_versions: true });
+        }
+    }
+    Ok(CompletionExamples { examples: own, of_all_versions: false })
 }
 
 /// The model of a campaign and its reliability, for views.
@@ -120,6 +187,8 @@ pub async fn examples(
 pub struct CompletionReport {
     /// Version of the potential whose walks found the structures.
     pub version: u32,
+    /// Whether they are those of all versions, without γ, because too few labels of this one are finished.
+    pub of_all_versions: bool,
     /// Finished structures that the model was learned from.
     pub finished: usize,
     /// Of them, those that failed.
@@ -162,11 +231,12 @@ impl CompletionReport {
         protocol: ContentHash,
         version: u32,
     ) -> Result<Option<Self>, StoreError> {
-        let examples = examples(store, protocol, version).await?;
+        let CompletionExamples { examples, of_all_versions } = examples(store, protocol, version).await?;
         let Some(model) = CompletionModel::fit(&examples) else { return Ok(None) };
         let diagram = reliability(&examples);
         Ok(Some(Self {
             version,
+            of_all_versions,
             finished: model.finished,
             failed: model.failed,
             is_regression: !model.coefficients.is_constant(),
@@ -208,64 +278,4 @@ fn named(coefficients: &CompletionCoefficients) -> Vec<(String, f64)> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn predictors(gamma_max: f64, relative_volume: f64) -> CompletionPredictors {
-        CompletionPredictors { gamma_max, relative_volume, shortest_bond: 0.9, fractions: vec![(13, 1.0)] }
-    }
-
-    /// The random number of a place, between 0 and 1 (Steele, Lea and Flood's SplitMix64).
-    fn uniform(place: usize) -> f64 {
-        let mut z = (place as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x9e37_79b9_7f4a_7c15);
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
-    }
-
-    /// Structures whose labels fail more often the larger their volume.
-    fn expanded(number: usize) -> Vec<CompletionExample> {
-        let example = |place: usize| {
-            let volume = 0.8 + 0.8 * uniform(3 * place);
-            let probability = 1.0 / (1.0 + (12.0 * (volume - 1.3)).exp());
-            let completed = uniform(3 * place + 1) < probability;
-            CompletionExample { predictors: predictors(1.0 + uniform(3 * place + 2), volume), completed }
-        };
-        (0..number).map(example).collect()
-    }
-
-    #[test]
-    fn the_share_holds_until_there_is_enough_to_learn_from() {
-        assert_eq!(CompletionModel::fit(&[]), None);
-        let examples = expanded(400);
-        let (labelled, failed): (Vec<_>, Vec<_>) =
-            examples.into_iter().partition(|example| example.completed);
-        let of = |labels: usize, failures: usize| {
-            let all: Vec<_> = labelled[..labels].iter().chain(&failed[..failures]).cloned().collect();
-            CompletionModel::fit(&all).unwrap()
-        };
-        for (labels, failures) in [(16, 3), (18, 2), (2, 30)] {
-            let model = of(labels, failures);
-            let share = labels as f64 / (labels + failures) as f64;
-            assert!(model.coefficients.is_constant(), "{labels} {failures}");
-            assert!((model.probability(&predictors(1.0, 1.6)) - share).abs() < 1e-12);
-        }
-        assert_eq!(of(5, 0).probability(&predictors(1.0, 1.0)), 1.0);
-        assert!(!of(17, 3).coefficients.is_constant());
-    }
-
-    #[test]
-    fn it_learns_what_makes_labels_fail_and_is_judged_on_others() {
-        let examples = expanded(600);
-        let model = CompletionModel::fit(&examples).unwrap();
-        let at = |volume: f64| model.probability(&predictors(1.5, volume));
-        assert!(at(1.0) > 0.9 && (at(1.3) - 0.5).abs() < 0.12 && at(1.55) < 0.15, "{model:?}");
-        let diagram = reliability(&examples);
-        assert_eq!(diagram.number(), 600);
-        assert!(diagram.brier_score().unwrap() < 0.6 * diagram.brier_score_of_share().unwrap());
-        for bin in diagram.bins().iter().filter(|bin| bin.number >= 40) {
-            assert!((bin.predicted.unwrap() - bin.observed.unwrap()).abs() < 0.1, "{bin:?}");
-        }
-        assert_eq!(named(&model.coefficients).len(), 5, "one element has no coefficient");
-    }
-}
+mod tests;

@@ -26,6 +26,8 @@ pub mod provenance;
 pub mod reference_check;
 pub mod refit_progress;
 pub mod snapshot;
+#[cfg(test)]
+mod tests;
 pub mod version_finds;
 pub mod versions;
 pub mod walk_ends;

@@ -63,7 +63,7 @@ impl Frame {
         let structure = structure(0, SHORTEST);
         let predictors =
             CompletionPredictors::of_structure(&structure, self.gamma, Some(self.relative_volume)).unwrap();
-        CompletionExample { predictors, completed: self.completed }
+        CompletionExample { predictors, completed: self.completed, seed_structure: 0, walk: 0 }
     }
 }
 

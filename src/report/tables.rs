@@ -50,7 +50,7 @@ pub fn all(data: &ReportData) -> Vec<PageTable> {
             labels::energy_offsets(&found.statistics),
             labels::quantiles("quantiles-gamma", "γ", &found.statistics.all.gamma),
             labels::quantiles("quantiles-gamma-nbr", "γ_{nbr}", &found.statistics.all.gamma_nbr),
-            calibration::bounds("error-bounds", &found.calibration.summary().found),
+            calibration::found(&found.calibration.summary()),
             calibration::by_value(&found.calibration.summary()),
         ]);
     }

@@ -37,6 +37,7 @@ fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [PageTa
                 table("pair-tests"),
                 table("pair-counts"),
                 table("comparison"),
+                table("comparison-errors"),
                 table("comparison-ranks"),
                 table("auc-by-threshold"),
                 table("elements"),

@@ -15,6 +15,7 @@ use wire::{CompletionCoefficients, ContentHash};
 use super::RunContext;
 use crate::config::LabelOrder;
 use crate::exit_status::CommandError;
+use crate::output::log_and_warn;
 
 /// Time between two looks at the queue.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);
@@ -81,9 +82,23 @@ impl LabelOrderTask {
         };
         let first = keeper.progress().await?;
         keeper.compute().await?;
-        task.spawn(keeper.keep(first));
+        task.spawn(async move {
+            if let Some(panic) = panic_of(keeper.keep(first)).await {
+                log_and_warn(format!(
+                    "the order of the label queue is no longer computed, and labels go on in the last one: {panic}; please report this"
+                ));
+            }
+        });
         Ok(Self { completion: Some(receiver), _task: task })
     }
+}
+
+/// Runs a task to its end. Returns what it panicked with, if it did.
+async fn panic_of(task: impl Future<Output = ()> + Send + 'static) -> Option<String> {
+    let mut tasks = JoinSet::new();
+    tasks.spawn(task);
+    let error = tasks.join_next().await?.err()?;
+    error.is_panic().then(|| error.to_string())
 }
 
 impl OrderKeeper {
@@ -115,7 +130,7 @@ impl OrderKeeper {
     async fn compute(&mut self) -> Result<(), StoreError> {
         if !self.by_value {
             let examples = completion_model::examples(&self.store, self.protocol, self.version).await?;
-            self.send(CompletionModel::fit(&examples));
+            self.send(CompletionModel::fit(&examples.examples));
             return Ok(());
         }
         let OrderInputs { rows, covering, completion } = self.reader.read(&self.store, self.protocol).await?;
@@ -160,6 +175,13 @@ impl QueueProgress {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test]
+    async fn a_panic_is_told() {
+        let told = panic_of(async { panic!("a bug") }).await;
+        assert!(told.as_ref().is_some_and(|told| told.contains("a bug")), "{told:?}");
+        assert_eq!(panic_of(async {}).await, None);
+    }
 
     #[test]
     fn the_order_is_computed_again_when_a_tenth_of_the_queue_has_changed() {

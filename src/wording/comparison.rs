@@ -31,6 +31,7 @@ pub fn notes(comparison: &WalkComparison) -> Vec<String> {
         ));
     }
     notes.extend(sampled(comparison));
+    notes.extend(chosen(comparison));
     notes
 }
 
@@ -127,19 +128,39 @@ fn sampled(comparison: &WalkComparison) -> Option<String> {
     })
 }
 
-/// An error over the pairs as views show it.
+/// What labels are missing, and that those by value were chosen.
+fn chosen(comparison: &WalkComparison) -> Vec<String> {
+    let WalkComparison { sampled_structures, chosen_by_value, unfinished, .. } = comparison;
+    let mut notes = Vec::new();
+    if *chosen_by_value > 0 {
+        notes.push(format!(
+            "the queue chose {chosen_by_value} of {sampled_structures} structures by value, which prefers large expected errors: medians, ρ and \
+             ROC-AUC are of what was labelled, not of what was found"
+        ));
+    }
+    if *unfinished > 0 {
+        notes.push(format!("{} unfinished", count(*unfinished, "label job")));
+    }
+    notes
+}
+
+/// An error as views show it.
 #[derive(Clone, Copy, Serialize)]
 pub struct ShownError {
     /// Its name and unit.
     pub name: &'static str,
     /// Its key in the JSON of the pairs.
     pub key: &'static str,
+    /// The key of its median in the JSON of a group, if that has it.
+    pub group_key: Option<&'static str>,
     /// Factor to its unit.
     pub factor: f64,
     /// Number of decimals.
     pub digits: usize,
     #[serde(skip)]
     of: fn(&PairedErrors) -> &PairedQuantity,
+    #[serde(skip)]
+    of_group: fn(&ComparedGroup) -> Option<&ConfidenceEstimate>,
 }
 
 /// A group of structures as views show it.
@@ -160,30 +181,38 @@ const ERRORS: [ShownError; 4] = [
     ShownError {
         name: "force MAE (eV/Å)",
         key: "force_mae",
+        group_key: Some("median_force_mae"),
         factor: 1.0,
         digits: 3,
         of: |pairs| &pairs.force_mae,
+        of_group: |group| Some(&group.median_force_mae),
     },
     ShownError {
         name: "mean |ΔF| (eV/Å)",
         key: "mean_force_error",
+        group_key: None,
         factor: 1.0,
         digits: 3,
         of: |pairs| &pairs.mean_force_error,
+        of_group: |_| None,
     },
     ShownError {
         name: "energy error (meV/atom)",
         key: "energy",
+        group_key: Some("median_energy"),
         factor: 1000.0,
         digits: 1,
         of: |pairs| &pairs.energy,
+        of_group: |group| Some(&group.median_energy),
     },
     ShownError {
         name: "stress error (GPa)",
         key: "stress",
+        group_key: Some("median_stress"),
         factor: GPA_PER_EV_A3,
         digits: 3,
         of: |pairs| &pairs.stress,
+        of_group: |group| Some(&group.median_stress),
     },
 ];
 
@@ -227,6 +256,23 @@ pub fn known_errors(pairs: &PairedErrors) -> Vec<(ShownError, &PairedQuantity)> 
     all.filter(|(_, quantity)| quantity.pairs > 0).collect()
 }
 
+/// For each error of pairs with failed labels: what the errors of those could make of the medians of either side.
+pub fn failure_ranges(pairs: &PairedErrors) -> Vec<(ShownError, Vec<(&'static str, String)>)> {
+    let ranges = |(error, quantity): (ShownError, &PairedQuantity)| {
+        let sides = [("biased", quantity.biased_between), ("control", quantity.control_between)].into_iter();
+        let shown =
+            sides.filter_map(|(side, range)| Some((side, median_range(range?, error.factor, error.digits))));
+        (error, shown.collect::<Vec<_>>())
+    };
+    known_errors(pairs).into_iter().map(ranges).filter(|(_, sides)| !sides.is_empty()).collect()
+}
+
+/// The medians over the structures of a group of each error that is known of any.
+pub fn group_errors(group: &ComparedGroup) -> Vec<(ShownError, ConfidenceEstimate)> {
+    let all = ERRORS.into_iter().filter_map(|error| Some((error, *(error.of_group)(group)?)));
+    all.filter(|(_, median)| median.value.is_some()).collect()
+}
+
 /// The groups with structures by name.
 pub fn groups(comparison: &WalkComparison) -> Vec<(&'static str, &ComparedGroup)> {
     shown_groups(comparison).map(|(shown, group)| (shown.name, group)).collect()
@@ -266,11 +312,13 @@ pub fn probability(p: Option<f64>) -> String {
     }
 }
 
-/// The range of a median whatever the errors of failed labels are: `0.610 to 0.720`, or without an upper end `at least 0.610`.
-pub fn median_range(range: (f64, Option<f64>), places: usize) -> String {
-    match range {
-        (low, Some(high)) => format!("{low:.places$} to {high:.places$}"),
-        (low, None) => format!("at least {low:.places$}"),
+/// The range of a median whatever the errors of failed labels are, times a factor: `0.610 to 0.720`, or without an upper end
+/// `at least 0.610`.
+pub fn median_range((low, high): (f64, Option<f64>), factor: f64, places: usize) -> String {
+    let low = factor * low;
+    match high {
+        Some(high) => format!("{low:.places$} to {:.places$}", factor * high),
+        None => format!("at least {low:.places$}"),
     }
 }
 
@@ -293,7 +341,8 @@ mod tests {
         assert_eq!(estimate(&found, 1.0, 3), "0.680 (0.610 to 0.725)");
         assert_eq!(estimate(&ConfidenceEstimate::default(), 1.0, 3), "–");
         assert_eq!(["2.6e-9", "0.039", "–"], [Some(2.6e-9), Some(0.039), None].map(probability));
-        assert_eq!(median_range((0.6, None), 2), "at least 0.60");
+        assert_eq!(median_range((0.6, None), 10.0, 2), "at least 6.00");
+        assert_eq!(median_range((0.6, Some(0.7)), 1.0, 1), "0.6 to 0.7");
     }
 
     #[test]

@@ -10,6 +10,10 @@ use crate::records::AtomGrades;
 pub struct FinishedStructure {
     /// Sequence number of the decision on it.
     pub decision: i64,
+    /// Number of its walk.
+    pub walk: u32,
+    /// Index of the seed structure.
+    pub seed_structure: u32,
     /// Whether it has a label; otherwise all attempts failed.
     pub labelled: bool,
     /// Largest γ under the original mixture.

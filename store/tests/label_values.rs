@@ -127,16 +127,18 @@ async fn values_are_computed_from_finished_and_queued_structures() {
     let failing = lease(&store, 2).await;
     store.fail(&failing, "crashed", "", 1, 3).await.unwrap();
 
-    let finished = store.finished_structures(dft, 0, 9).await.unwrap();
+    let finished = store.finished_structures(dft, Some(0), 9).await.unwrap();
     let found: Vec<_> = finished.iter().map(|row| (row.decision, row.labelled)).collect();
     assert_eq!(found, [(4, false), (3, true)], "newest first");
+    assert_eq!((finished[1].walk, finished[1].seed_structure), (0, 0));
+    assert_eq!(store.finished_structures(dft, None, 9).await.unwrap(), finished);
     assert_eq!((finished[1].gamma, finished[1].relative_volume), (Some(1.3 + 0.1), Some(1.01)));
     assert_eq!(
         ContentHash::from_structure(&finished[1].structure),
         ContentHash::from_structure(&done.structure)
     );
-    assert_eq!(store.finished_structures(dft, 0, 1).await.unwrap(), finished[..1]);
-    assert_eq!(store.finished_structures(dft, 1, 9).await.unwrap(), [], "no walk has this version");
+    assert_eq!(store.finished_structures(dft, Some(0), 1).await.unwrap(), finished[..1]);
+    assert_eq!(store.finished_structures(dft, Some(1), 9).await.unwrap(), [], "no walk has this version");
 
     let queued = store.queued_structures(dft, 9).await.unwrap();
     let found: Vec<_> = queued.iter().map(|row| (row.decision, row.priority, row.overtaken)).collect();
@@ -153,8 +155,8 @@ async fn values_are_computed_from_finished_and_queued_structures() {
     assert_eq!((features.len(), features[1]), (3 * ATOMS, 1.0));
     assert_eq!(store.features_of(77).await.unwrap(), None);
     store.exclude(&[names[2].clone()], "bad", 5).await.unwrap();
-    assert_eq!(store.finished_structures(dft, 0, 9).await.unwrap().len(), 1);
+    assert_eq!(store.finished_structures(dft, Some(0), 9).await.unwrap().len(), 1);
     // A guard rejected it before any calculation: nothing says whether that would have completed.
     store.fail(&held, "rejected_by_label_guard", "", 1, 6).await.unwrap();
-    assert_eq!(store.finished_structures(dft, 0, 9).await.unwrap().len(), 1);
+    assert_eq!(store.finished_structures(dft, Some(0), 9).await.unwrap().len(), 1);
 }

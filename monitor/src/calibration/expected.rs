@@ -15,6 +15,8 @@ pub struct ExpectedErrors {
     pub level: f64,
     /// Labelled structures from which the bounds follow.
     pub structures: u64,
+    /// Whether the queue chose these by value.
+    pub by_value: bool,
     /// The atom with the largest γ_nbr under the original mixture.
     pub worst: AtomErrorBound,
     /// Share of the candidate's atoms with a bound whose error was not above it. `None` without a label or bounds.
@@ -48,11 +50,12 @@ pub async fn expected_errors(
     let graded = grades.atoms.iter().filter_map(|atom| Some((atom, grade(atom)?)));
     let Some((worst, gamma_nbr)) = graded.max_by(|a, b| a.1.total_cmp(&b.1)) else { return Ok(None) };
     let (before, own) = before_label(store, protocol.hash, found.version, &details.structure.hash).await?;
-    let map = match &own {
-        Some(own) if own.ordered_by_value => &before.by_value,
-        Some(_) => &before.found,
-        None => before.in_use(),
+    // A label is compared with those that were chosen in the same way.
+    let by_value = match &own {
+        Some(own) => own.ordered_by_value,
+        None => before.is_by_value_at(gamma_nbr),
     };
+    let map = if by_value { &before.by_value } else { &before.found };
     let error = own.as_ref().and_then(|own| own.atoms.get(worst.atom)).map(|atom| atom.error);
     let bound = map.bound(gamma_nbr, Some(&worst.element));
     let held = |own: &ArrivedLabel| {
@@ -65,6 +68,7 @@ pub async fn expected_errors(
     Ok(Some(ExpectedErrors {
         level: CALIBRATION.level,
         structures: map.structures(),
+        by_value,
         worst: AtomErrorBound { atom: worst.atom, element: worst.element, gamma_nbr, bound, error },
         held: own.as_ref().and_then(held),
     }))

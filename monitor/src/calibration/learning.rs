@@ -85,7 +85,8 @@ pub(super) fn labelled_structure(arrival: &LabelArrival) -> Option<ArrivedLabel>
 impl CalibrationState {
     /// Compares a labelled structure with the bounds, then learns from it.
     pub(super) fn learn(&mut self, labelled: &ArrivedLabel) {
+        let number = self.structures();
         let map = if labelled.ordered_by_value { &mut self.by_value } else { &mut self.found };
-        map.learn(&labelled.atoms);
+        map.learn(number, &labelled.atoms);
     }
 }

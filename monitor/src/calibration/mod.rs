@@ -8,7 +8,7 @@ mod summary;
 #[cfg(test)]
 mod tests;
 
-use analysis::{Bins, ConformalMap, ConformalSettings, RollingCoverage};
+use analysis::{Bins, ConformalMap, ConformalSettings};
 use store::{Store, StoreError};
 use wire::ContentHash;
 
@@ -18,11 +18,11 @@ pub use expected::{AtomErrorBound, ExpectedErrors, expected_errors};
 pub use reader::CalibrationReader;
 pub use summary::{CalibrationBin, CalibrationCoverage, CalibrationMap, CalibrationSummary};
 
-/// What the bounds promise, and from how many structures they follow. Each bin has the bound of its newest 100 structures: with
-/// more, bounds of a changing collection lag behind. Synthetic campaigns whose grades and errors drift have bounds that hold for
-/// 90 % with this step size (the tests of `analysis::conformal`).
+/// What the bounds promise, and from how many structures they follow. Each bin has the bound of its newest 50 structures: with
+/// more, bounds of a changing collection lag behind. Synthetic campaigns have bounds that hold for 88 to 92 % with this step size,
+/// whether errors fall or rise (the tests of `analysis::conformal`).
 pub const CALIBRATION: ConformalSettings =
-    ConformalSettings { level: 0.9, least: 20, window: 100, step: 0.03, counted: 200 };
+    ConformalSettings { level: 0.9, least: 20, window: 50, step: 0.05, counted: 200 };
 
 /// The calibration of one version of the potential under one protocol.
 #[derive(Clone, Debug)]
@@ -49,12 +49,6 @@ pub async fn read(
     Ok(state)
 }
 
-/// Whether labels by value stand in for the others: with too few others for any bound, and more by value. The first labels of a campaign
-/// come before any value is known.
-fn is_by_value_in_use(found: u64, by_value: u64) -> bool {
-    found < CALIBRATION.least() as u64 && found < by_value
-}
-
 impl CalibrationState {
     fn new(version: u32) -> Self {
         let empty = ConformalMap::new(Bins::for_grades(), CALIBRATION);
@@ -69,30 +63,48 @@ impl CalibrationState {
     /// The bound of |ΔF|, eV/Å, of an atom of this element with this γ_nbr under the original mixture of the version: 90 % of such
     /// errors are expected to be below. `None` without enough labels in its bin.
     pub fn bound(&self, gamma_nbr: f64, element: &'static str) -> Option<f64> {
-        self.in_use().bound(gamma_nbr, Some(&element))
+        self.map_at(gamma_nbr).bound(gamma_nbr, Some(&element))
     }
 
-    /// Expected |ΔF|, eV/Å, of an atom with this γ_nbr under the original mixture of the version. `None` without enough labels in
-    /// its bin.
+    /// Expected |ΔF|, eV/Å, of an atom with this γ_nbr under the original mixture of the version. Without enough labels in its bin,
+    /// that of the nearest bin below that has them, which large grades exceed; without any below, of the nearest above. `None`
+    /// without such a bin, and for a grade that is not finite.
     pub fn expected_error(&self, gamma_nbr: f64) -> Option<f64> {
-        self.found.expected(gamma_nbr).or_else(|| self.by_value.expected(gamma_nbr))
+        let bins = self.found.bins();
+        let own = gamma_nbr.is_finite().then(|| bins.index_of(gamma_nbr))?;
+        let nearest_first = (0..=own).rev().chain(own + 1..bins.count());
+        nearest_first.filter_map(|bin| self.map_of(bin).window(bin)?.mean()).next()
     }
 
-    /// How often bounds held for the newest structures.
-    pub fn coverage(&self) -> Option<RollingCoverage> {
-        self.in_use().coverage()
+    /// Labels as found: the covered share of the atoms of each structure with a bound, in the order in which labels came.
+    pub fn outcomes(&self) -> Vec<f64> {
+        self.found.outcomes()
     }
 
-    /// The covered share of the atoms of each structure with a bound, in the order in which labels came.
-    pub fn outcomes(&self) -> &[f64] {
-        self.in_use().outcomes()
+    /// The same of labels by value.
+    pub fn outcomes_by_value(&self) -> Vec<f64> {
+        self.by_value.outcomes()
     }
 
-    /// The map for structures as the campaign finds them; with too few labels of these, the map of labels by value.
-    fn in_use(&self) -> &ConformalMap<&'static str> {
-        match is_by_value_in_use(self.found.structures(), self.by_value.structures()) {
-            true => &self.by_value,
-            false => &self.found,
+    /// The map that counts at a grade.
+    fn map_at(&self, gamma_nbr: f64) -> &ConformalMap<&'static str> {
+        self.map_of(self.found.bins().index_of(gamma_nbr))
+    }
+
+    fn is_by_value_at(&self, gamma_nbr: f64) -> bool {
+        self.is_by_value(self.found.bins().index_of(gamma_nbr))
+    }
+
+    fn map_of(&self, bin: usize) -> &ConformalMap<&'static str> {
+        if self.is_by_value(bin) { &self.by_value } else { &self.found }
+    }
+
+    /// Whether labels by value count in a bin: with too few of the others for a bound, or when most of these are older than as many
+    /// labels by value as a bin keeps. The others are a fairer sample of what the campaign finds, but not of what it finds now.
+    fn is_by_value(&self, bin: usize) -> bool {
+        match (self.found.window(bin), self.by_value.window(bin)) {
+            (Some(found), Some(by_value)) => found.is_outdated_by(by_value),
+            (found, by_value) => found.is_none() && by_value.is_some(),
         }
     }
 }

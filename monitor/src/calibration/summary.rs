@@ -3,7 +3,7 @@
 use analysis::{ConformalMap, ConformalWindow, RollingCoverage};
 use serde::{Deserialize, Serialize};
 
-use super::{CalibrationState, is_by_value_in_use};
+use super::CalibrationState;
 
 /// The bounds of a version.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
@@ -36,10 +36,12 @@ pub struct CalibrationMap {
 /// How often bounds from before a structure's label came held.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize, Serialize)]
 pub struct CalibrationCoverage {
-    /// Mean share of a structure's atoms.
+    /// Mean share of a structure's atoms with a bound.
     pub share: f64,
     /// Number of structures.
     pub structures: usize,
+    /// Mean share of a structure's atoms without a bound, over all structures since the oldest of these; of a bin 0.
+    pub unbounded: f64,
 }
 
 /// One bin of γ_nbr.
@@ -61,28 +63,54 @@ pub struct CalibrationBin {
     pub level_in_force: f64,
     /// How often the bounds of this bin held.
     pub coverage: Option<CalibrationCoverage>,
+    /// Whether the bin has enough structures, and its bounds count for structures without a label, not those of the other map.
+    pub in_use: bool,
 }
 
 impl CalibrationState {
     /// Its values.
     pub fn summary(&self) -> CalibrationSummary {
-        let by_value = (self.by_value.structures() > 0).then(|| CalibrationMap::new(&self.by_value));
-        CalibrationSummary { version: self.version, found: CalibrationMap::new(&self.found), by_value }
+        let found = CalibrationMap::new(&self.found, |bin| !self.is_by_value(bin));
+        let by_value = (self.by_value.structures() > 0)
+            .then(|| CalibrationMap::new(&self.by_value, |bin| self.is_by_value(bin)));
+        CalibrationSummary { version: self.version, found, by_value }
     }
 }
 
 impl CalibrationSummary {
-    /// The map for structures as the campaign finds them; with too few labels of these, the map of labels by value.
-    pub fn in_use(&self) -> &CalibrationMap {
-        match &self.by_value {
-            Some(by_value) if is_by_value_in_use(self.found.structures, by_value.structures) => by_value,
-            _ => &self.found,
-        }
+    /// The bound of |ΔF|, eV/Å, of an atom of this element with this γ_nbr, from labels as found or by value, whichever count in its
+    /// bin. `None` without enough of them.
+    pub fn bound(&self, gamma_nbr: f64, element: &str) -> Option<f64> {
+        self.maps().find_map(|map| map.bound(gamma_nbr, element))
+    }
+
+    /// The bins of all atoms that are in use, by ascending γ_nbr, and whether each is of labels by value.
+    pub fn pooled(&self) -> Vec<(&CalibrationBin, bool)> {
+        let found = self.found.pooled().map(|bin| (bin, false));
+        let by_value = self.by_value.iter().flat_map(CalibrationMap::pooled).map(|bin| (bin, true));
+        let mut bins: Vec<_> = found.chain(by_value).filter(|(bin, _)| bin.in_use).collect();
+        let edge = |bin: &CalibrationBin| bin.above.unwrap_or(f64::NEG_INFINITY);
+        bins.sort_by(|(a, _), (b, _)| edge(a).total_cmp(&edge(b)));
+        bins
+    }
+
+    /// The map of labels by value, if there are any and it is asked for; otherwise that of labels as found.
+    pub fn map(&self, by_value: bool) -> &CalibrationMap {
+        self.by_value.as_ref().filter(|_| by_value).unwrap_or(&self.found)
+    }
+
+    /// Number of structures with a label.
+    pub fn structures(&self) -> u64 {
+        self.maps().map(|map| map.structures).sum()
+    }
+
+    fn maps(&self) -> impl Iterator<Item = &CalibrationMap> {
+        [&self.found].into_iter().chain(&self.by_value)
     }
 }
 
 impl CalibrationMap {
-    fn new(map: &ConformalMap<&'static str>) -> Self {
+    fn new(map: &ConformalMap<&'static str>, is_in_use: impl Fn(usize) -> bool) -> Self {
         let settings = map.settings();
         let bin = |(element, index, window): (Option<&&str>, usize, &ConformalWindow)| {
             let (above, up_to) = map.bins().edges(index);
@@ -94,27 +122,34 @@ impl CalibrationMap {
                 bound: window.bound(),
                 mean: window.mean(),
                 level_in_force: window.level(),
-                coverage: window
-                    .coverage()
-                    .map(|(share, structures)| CalibrationCoverage { share, structures }),
+                coverage: window.coverage().map(|(share, structures)| CalibrationCoverage {
+                    share,
+                    structures,
+                    unbounded: 0.0,
+                }),
+                in_use: is_in_use(index) && window.is_sufficient(),
             }
+        };
+        let coverage = |RollingCoverage { share, structures, unbounded }| CalibrationCoverage {
+            share,
+            structures,
+            unbounded,
         };
         Self {
             level: settings.level,
             least_structures: settings.least(),
             window_structures: settings.window,
             structures: map.structures(),
-            coverage: map
-                .coverage()
-                .map(|RollingCoverage { share, structures }| CalibrationCoverage { share, structures }),
+            coverage: map.coverage().map(coverage),
             bins: map.windows().map(bin).collect(),
         }
     }
 
-    /// The bound of |ΔF|, eV/Å, of an atom of this element with this γ_nbr. `None` without enough labels in its bin.
-    pub fn bound(&self, gamma_nbr: f64, element: &str) -> Option<f64> {
+    /// The bound of a bin in use. `None` without enough labels in it.
+    fn bound(&self, gamma_nbr: f64, element: &str) -> Option<f64> {
         let holds = |bin: &&CalibrationBin| {
             gamma_nbr.is_finite()
+                && bin.in_use
                 && bin.structures >= self.least_structures
                 && bin.above.is_none_or(|edge| gamma_nbr > edge)
                 && bin.up_to.is_none_or(|edge| gamma_nbr <= edge)

@@ -11,7 +11,7 @@ use wire::{ContentHash, Origin};
 /// Largest number of labelled, and of failed, structures that are kept, 150 bytes each. Beyond it, a sample of whole walks is kept, the
 /// same walks of both.
 const MAX_FRAMES: usize = 1 << 17;
-/// Largest number of atoms that are kept, 48 bytes each. Beyond it, a systematic sample is kept.
+/// Largest number of atoms that are kept, 56 bytes each. Beyond it, a systematic sample is kept.
 const MAX_ATOMS: usize = 1 << 18;
 
 /// Labelled and failed structures of biased and control walks.
@@ -20,6 +20,8 @@ pub(super) struct ComparedFrames {
     labelled: GroupSample<ComparedFrame>,
     pub atoms: SystematicSample<ComparedAtom>,
     failed: GroupSample<FailedFrame>,
+    /// Number of label jobs that wait or are in work.
+    pub unfinished: u64,
     /// Of each control walk, its biased walk.
     matched_walks: BTreeMap<u32, u32>,
 }
@@ -38,10 +40,13 @@ pub(super) struct FramePlace {
 #[derive(Clone, Debug)]
 pub(super) struct ComparedFrame {
     pub place: FramePlace,
-    pub step: u64,
+    /// Segment and step of its walk, which has one structure there.
+    pub at: (u32, u64),
     pub content: ContentHash,
     /// Both a biased walk and a control walk found it.
     pub is_shared: bool,
+    /// Whether the queue chose its label by value.
+    pub by_value: bool,
     pub errors: FrameErrors,
     /// Kinetic temperature, K.
     pub temperature: f64,
@@ -66,7 +71,8 @@ pub(super) struct FrameErrors {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ComparedAtom {
     pub place: FramePlace,
-    pub step: u64,
+    /// As [`ComparedFrame::at`].
+    pub at: (u32, u64),
     pub is_shared: bool,
     pub species: Species,
     /// γ under the original mixture.
@@ -96,6 +102,7 @@ impl ComparedFrames {
             labelled: GroupSample::new(MAX_FRAMES),
             atoms: SystematicSample::new(MAX_ATOMS),
             failed: GroupSample::new(MAX_FRAMES),
+            unfinished: 0,
             matched_walks,
         }
     }
@@ -119,8 +126,8 @@ impl ComparedFrames {
             {
                 let (species, gamma, gamma_nbr, error) = (*species, *gamma, *gamma_nbr, norm(*difference));
                 if [gamma, gamma_nbr, error].into_iter().all(f64::is_finite) {
-                    let step = id.step;
-                    let atom = ComparedAtom { place, step, is_shared, species, gamma, gamma_nbr, error };
+                    let at = (id.segment, id.step);
+                    let atom = ComparedAtom { place, at, is_shared, species, gamma, gamma_nbr, error };
                     self.atoms.add(atom);
                 }
             }
@@ -133,9 +140,10 @@ impl ComparedFrames {
         };
         let frame = ComparedFrame {
             place,
-            step: id.step,
+            at: (id.segment, id.step),
             content: id.content,
             is_shared,
+            by_value: row.label.details.ordered_by_value,
             errors,
             temperature: view.temperature(),
             relative_volume: view.relative_volume(),

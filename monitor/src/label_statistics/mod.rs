@@ -4,6 +4,8 @@
 pub mod comparison;
 mod frames;
 mod json;
+#[cfg(test)]
+mod tests;
 
 use std::collections::{BTreeMap, HashSet};
 
@@ -11,8 +13,8 @@ use analysis::{Bins, Completion, ForceErrors};
 use atoms::cell::{norm, sub};
 use serde_json::Value;
 use store::{
-    AtomGrades, ExportFilter, ExportRow, ExportSource, FinishedCandidate, Protocol, Store, StoreError,
-    WalkVersions,
+    AtomGrades, ExportFilter, ExportRow, ExportSource, FinishedCandidate, JobState, Protocol, Store,
+    StoreError, WalkVersions,
 };
 use wire::{ContentHash, Origin};
 
@@ -93,6 +95,7 @@ pub async fn read(
         by_expansion: Completion::new(Bins::for_volume_ratio()),
         compared: ComparedFrames::new(store.matched_walks().await?),
     };
+    statistics.compared.unfinished = unfinished(store, protocol).await?;
     let shared = store.structures_of_both_origins().await?;
     let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
     let mut after = None;
@@ -111,6 +114,16 @@ pub async fn read(
         own.for_each(|candidate| statistics.finished(candidate, &shared));
     }
     Ok(statistics)
+}
+
+/// Number of label jobs of a protocol that wait or are in work.
+async fn unfinished(store: &Store, protocol: ContentHash) -> Result<u64, StoreError> {
+    let protocols = store.protocols().await?;
+    let is_of = |name: &str| protocols.iter().any(|found| found.hash == protocol && found.name == name);
+    let jobs = store.jobs_by_protocol().await?.into_iter();
+    let waiting =
+        jobs.filter(|(name, state, _)| is_of(name) && matches!(state, JobState::Queued | JobState::Leased));
+    Ok(waiting.map(|(.., number)| number).sum())
 }
 
 impl LabelStatistics {
@@ -169,7 +182,16 @@ impl LabelStatistics {
         self.by_version.entry(version).or_insert_with(|| ErrorsByGrade::new(MAX_SAMPLES_OF_VERSION))
     }
 
+    /// Adds a candidate whose label job is finished. `shared`: structures that walks of both origins found. Each has one job, and
+    /// counts with the biased walk.
     fn finished(&mut self, candidate: &FinishedCandidate, shared: &HashSet<ContentHash>) {
+        let is_shared = shared.contains(&candidate.content);
+        if candidate.unlabelled.is_some() {
+            self.compared.add_failed(candidate, is_shared);
+        }
+        if is_shared && candidate.origin == Origin::Control {
+            return;
+        }
         for (completion, value) in
             [(&mut self.by_gamma, candidate.gamma), (&mut self.by_expansion, candidate.relative_volume)]
         {
@@ -178,9 +200,10 @@ impl LabelStatistics {
                 false => completion.add_failed(value, candidate.candidate.clone()),
             }
         }
-        if let Some(grades) = &candidate.unlabelled {
-            self.compared.add_failed(candidate, shared.contains(&candidate.content));
-            self.for_origin(candidate.origin, |all| all.unlabelled(grades));
+        match &candidate.unlabelled {
+            Some(grades) if is_shared => self.all.unlabelled(grades),
+            Some(grades) => self.for_origin(candidate.origin, |of| of.unlabelled(grades)),
+            None => {}
         }
     }
 }

@@ -11,7 +11,7 @@ use wire::{CompletionPredictors, ContentHash};
 
 use super::{CoveringLabel, FeatureScales, MeanFeatures, QueuedLabel};
 use crate::calibration::{CalibrationReader, CalibrationState};
-use crate::completion_model::{CompletionExample, CompletionModel, MAX_FINISHED};
+use crate::completion_model::{CompletionExample, CompletionModel, MAX_FINISHED, with_other_versions};
 use crate::label_cost::CostEstimator;
 
 /// Largest number of queued structures that get a value: the oldest of the highest priority. The others follow in the order in
@@ -121,7 +121,7 @@ impl KnownStructures {
         used: &mut HashSet<i64>,
         covering: &mut Vec<CoveringLabel>,
     ) -> Result<Option<CompletionModel>, StoreError> {
-        let finished = store.finished_structures(protocol, version, MAX_FINISHED).await?;
+        let finished = store.finished_structures(protocol, Some(version), MAX_FINISHED).await?;
         let mut examples = Vec::with_capacity(finished.len());
         for found in &finished {
             used.insert(found.decision);
@@ -132,6 +132,8 @@ impl KnownStructures {
             let example = |predictors: &CompletionPredictors| CompletionExample {
                 predictors: predictors.clone(),
                 completed: found.labelled,
+                seed_structure: found.seed_structure,
+                walk: found.walk,
             };
             examples.extend(known.predictors.as_ref().map(example));
             if let Some(features) = known.features.as_ref().filter(|_| found.labelled) {
@@ -139,7 +141,7 @@ impl KnownStructures {
                 covering.push(CoveringLabel { decision: found.decision, version, features });
             }
         }
-        Ok(CompletionModel::fit(&examples))
+        Ok(CompletionModel::fit(&with_other_versions(store, protocol, examples).await?.examples))
     }
 
     /// What does not change of a structure, computed the first time.

@@ -39,8 +39,8 @@ impl ScoreCalibration {
     pub fn bound(&mut self, structure: &Structure, gamma_nbr: &[f64]) -> Option<f64> {
         let atoms = structure.species.iter().zip(gamma_nbr);
         let worst = atoms.max_by(|a, b| a.1.total_cmp(b.1));
-        let map = self.file.summary.in_use();
-        let bound = worst.and_then(|(species, grade)| map.bound(*grade, species.symbol()));
+        let summary = &self.file.summary;
+        let bound = worst.and_then(|(species, grade)| summary.bound(*grade, species.symbol()));
         self.without += u64::from(bound.is_none());
         bound
     }
@@ -98,7 +98,7 @@ async fn from_campaign(source: &Path, graded: &GradeFiles) -> Result<Calibration
             continue;
         }
         let summary = calibration::read(&store, protocol.hash, version).await?.summary();
-        if found.is_none() || summary.in_use().structures > 0 {
+        if found.is_none() || summary.structures() > 0 {
             found = Some(CalibrationFile::new(&store, &protocol, summary).await?);
         }
     }

@@ -3,12 +3,14 @@
 use std::io::{self, Write};
 
 use analysis::SHOWN_ERROR_THRESHOLDS;
+use atoms::units::GPA_PER_EV_A3;
 use monitor::label_statistics::LARGE_FORCE_ERROR;
 use monitor::label_statistics::comparison::{ComparedGroup, PairedErrors, PairedQuantity, WalkComparison};
 
 use crate::output::{TextTable, decimals};
 use crate::wording::comparison::{
-    ShownError, elements, estimate, groups, known_errors, larger, median_range, notes, probability,
+    ShownError, elements, estimate, failure_ranges, groups, known_errors, larger, median_range, notes,
+    probability,
 };
 
 /// Writes the section; nothing without labelled structures.
@@ -59,47 +61,57 @@ fn write_pairs(out: &mut dyn Write, pairs: &PairedErrors) -> io::Result<()> {
     }
     writeln!(out)?;
     table.write(out)?;
-    let sides = [("biased", pairs.force_mae.biased_between), ("control", pairs.force_mae.control_between)];
-    for (name, range) in sides {
-        if let Some(range) = range {
-            let range = median_range(range, 3);
-            writeln!(
-                out,
-                "{name} median of the force MAE, whatever the errors of failed labels: {range} eV/Å"
-            )?;
-        }
+    for (error, sides) in failure_ranges(pairs) {
+        let sides: Vec<_> = sides.into_iter().map(|(side, range)| format!("{side} {range}")).collect();
+        writeln!(out, "median for any errors of failed labels, {}: {}", error.name, sides.join(", "))?;
     }
     Ok(())
 }
 
+/// The structures of each group, then their atoms.
 fn write_groups(out: &mut dyn Write, groups: &[(&str, &ComparedGroup)]) -> io::Result<()> {
-    let area = format!(">ROC-AUC(γ_nbr), {LARGE_FORCE_ERROR} eV/Å");
-    let mut table = TextTable::new(&[
-        "",
+    let mut structures = TextTable::new(&[
+        "medians over structures",
         ">structures",
         ">failed",
         ">mean T (K)",
         ">mean V/V₀",
-        ">median MAE (eV/Å)",
-        ">median |ΔF| (eV/Å)",
-        ">ρ(γ_nbr)",
-        &area,
+        ">MAE (eV/Å)",
+        ">for any errors of failed",
+        ">energy (meV/atom)",
+        ">stress (GPa)",
     ]);
+    let area = |grade: &str| format!(">ROC-AUC({grade}), {LARGE_FORCE_ERROR} eV/Å");
+    let [by_gamma, by_gamma_nbr] = ["γ", "γ_nbr"].map(area);
+    let mut atoms =
+        TextTable::new(&["atoms", ">median |ΔF| (eV/Å)", ">ρ(γ)", ">ρ(γ_nbr)", &by_gamma, &by_gamma_nbr]);
     for (name, group) in groups {
-        table.push(vec![
+        let between = group.median_force_mae_between.map(|range| median_range(range, 1.0, 3));
+        structures.push(vec![
             (*name).into(),
             group.structures.to_string(),
             group.failed.to_string(),
             decimals(group.mean_temperature, 0),
             decimals(group.mean_relative_volume, 3),
             estimate(&group.median_force_mae, 1.0, 3),
+            between.unwrap_or_else(|| "–".into()),
+            estimate(&group.median_energy, 1000.0, 1),
+            estimate(&group.median_stress, GPA_PER_EV_A3, 3),
+        ]);
+        atoms.push(vec![
+            (*name).into(),
             estimate(&group.median_error, 1.0, 3),
+            estimate(&group.gamma.spearman, 1.0, 3),
             estimate(&group.gamma_nbr.spearman, 1.0, 3),
+            estimate(&group.gamma.area_above(LARGE_FORCE_ERROR), 1.0, 3),
             estimate(&group.gamma_nbr.area_above(LARGE_FORCE_ERROR), 1.0, 3),
         ]);
     }
-    writeln!(out)?;
-    table.write(out)
+    for table in [structures, atoms] {
+        writeln!(out)?;
+        table.write(out)?;
+    }
+    Ok(())
 }
 
 /// The ROC-AUC of γ_nbr for some thresholds of the force error. `--json` has all.

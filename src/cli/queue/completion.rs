@@ -19,10 +19,11 @@ pub async fn read(location: &Location) -> Result<Option<CompletionReport>, Comma
 pub fn write(out: &mut dyn Write, found: Option<&CompletionReport>) -> io::Result<()> {
     let Some(found) = found else { return writeln!(out, "no label is finished yet") };
     let CompletionReport { version, finished, failed, brier_score, brier_score_of_share, .. } = found;
-    writeln!(
-        out,
-        "{finished} finished labels of version {version} of the potential, {failed} of them failed"
-    )?;
+    let of = match found.of_all_versions {
+        true => format!("all versions of the potential, without γ, since version {version} has too few"),
+        false => format!("version {version} of the potential"),
+    };
+    writeln!(out, "{finished} finished labels of {of}; {failed} of them failed")?;
     if found.is_regression {
         let mut table = TextTable::new(&["predictor", ">coefficient"]);
         for (name, value) in &found.coefficients {
@@ -49,7 +50,8 @@ pub fn write(out: &mut dyn Write, found: Option<&CompletionReport>) -> io::Resul
     table.write(out)?;
     writeln!(
         out,
-        "Brier score {}, of the share that completes {}; each structure is predicted from the others",
+        "Brier score {}, of the share that completes {}; each structure is predicted from those of other seed structures, or \
+         walks with fewer than five of these",
         decimals(*brier_score, 4),
         decimals(*brier_score_of_share, 4)
     )

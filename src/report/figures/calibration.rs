@@ -2,7 +2,7 @@
 
 use ::figures::{Axis, AxisScale, Colour, Figure, LegendKey, Marker, Panel, Rectangle, legend};
 use analysis::{QuantileBin, binned_quantiles, logarithmic_edges};
-use monitor::calibration::{CALIBRATION, CalibrationMap, CalibrationState};
+use monitor::calibration::{CALIBRATION, CalibrationBin, CalibrationState};
 
 use super::super::collections::Collections;
 use super::super::report_data::ReportData;
@@ -23,15 +23,15 @@ pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
     let labels =
         data.labels.as_ref().filter(|labels| labels.calibration.structures() > 0).ok_or(NO_LABELS)?;
     let summary = labels.calibration.summary();
-    let map = summary.in_use();
-    if map.pooled().all(|bin| bin.bound.is_none()) {
+    let bins: Vec<_> = summary.pooled().into_iter().map(|(bin, _)| bin).collect();
+    if bins.iter().all(|bin| bin.bound.is_none()) {
         return Err(format!("{}.", wording::calibration::sentence(&summary)));
     }
     let description = "Bounds of the force error by grade, and how often they held";
     let mut figure = Figure::new("error-bounds", description, WIDTH, 226.0);
     let mut numbers = Csv::new(&["panel", "low", "high", "number", "value"]);
     let places = row(2, [46.0, 56.0, 12.0], 28.0, 162.0);
-    draw_bounds(&mut figure, &mut numbers, &data.collections, map, places[0]);
+    draw_bounds(&mut figure, &mut numbers, &data.collections, &bins, places[0]);
     draw_coverage(&mut figure, &mut numbers, &labels.calibration, places[1]);
     let keys = [
         (LegendKey::Line(Colour::VERMILLION.line(1.3)), "bound"),
@@ -39,11 +39,15 @@ pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
         (LegendKey::Line(Colour::BLUE.line(1.0)), "P_{90} of labelled atoms"),
     ];
     legend(&mut figure, [WIDTH - 8.0, 12.0], &keys);
+    let by_value = match labels.calibration.outcomes_by_value().len() {
+        0 => String::new(),
+        number => format!("; blue, of labels chosen by value, n = {}", grouped(number as u64)),
+    };
     let caption = format!(
         "a, Bound of the force error |F_{{model}} − F_{{label}}| and expected error by γ_{{nbr}} under the original mixture, from the newest \
          structures of each bin, with the 90 % quantile of all labelled atoms in equally wide bins with at least {MIN_ATOMS} atoms: {}. b, \
          Share of the atoms of a structure whose error was not above the bound from before its label came, mean over the newest {} \
-         structures at that time (n = {}). Dashed grey, γ_{{nbr}} = 1 and the promised share.{}",
+         structures at that time (n = {}{by_value}). Dashed grey, γ_{{nbr}} = 1 and the promised share.{}",
         wording::calibration::sentence(&summary).replace("γ_nbr", "γ_{nbr}"),
         CALIBRATION.counted,
         grouped(labels.calibration.outcomes().len() as u64),
@@ -56,14 +60,14 @@ fn draw_bounds(
     figure: &mut Figure,
     numbers: &mut Csv,
     collections: &Collections,
-    map: &CalibrationMap,
+    bins: &[&CalibrationBin],
     place: Rectangle,
 ) {
     let atoms = collections.both().into_iter().flat_map(|(_, of)| of.atoms.items());
     let pairs = atoms.filter_map(|atom| Some((atom.gamma_nbr, atom.error?)));
     let pairs: Vec<_> = pairs.filter(|(x, y)| x.is_finite() && y.is_finite()).collect();
     let (grades, mut errors): (Vec<_>, Vec<_>) = pairs.iter().copied().unzip();
-    errors.extend(map.pooled().flat_map(|bin| [bin.bound, bin.mean]).flatten());
+    errors.extend(bins.iter().flat_map(|bin| [bin.bound, bin.mean]).flatten());
     let x = axis("γ_{nbr}", AxisScale::Logarithmic, &grades, Some(1.0));
     let y = axis("force error (eV Å^{−1})", AxisScale::Logarithmic, &errors, None);
     let (low, high) = (x.low, x.high);
@@ -76,7 +80,7 @@ fn draw_bounds(
         found.iter().filter_map(|band| Some([middle(&panel, band), quantile(band)?])).collect();
     panel.line(points.clone(), Colour::BLUE.line(1.0));
     panel.dots(points, Marker::Disc, 1.9, Colour::BLUE, None);
-    for bin in map.pooled() {
+    for bin in bins {
         let (left, right) = (bin.above.unwrap_or(low).max(low), bin.up_to.unwrap_or(high).min(high));
         if left >= right {
             continue;
@@ -87,7 +91,7 @@ fn draw_bounds(
     }
     panel.panel_letter('a');
     panel.draw(figure);
-    for bin in map.pooled() {
+    for bin in bins {
         numbers.push(&[
             "a, bound".to_owned(),
             csv::number(bin.above),
@@ -108,22 +112,29 @@ fn draw_bounds(
 }
 
 fn draw_coverage(figure: &mut Figure, numbers: &mut Csv, calibration: &CalibrationState, place: Rectangle) {
-    let curve = rolling_means(calibration.outcomes(), CALIBRATION.counted);
-    let most = curve.last().map_or(1.0, |point| point[0]);
-    let least = curve.iter().map(|point| point[1]).fold(80.0, f64::min);
-    let x = Axis::new("structures with a bound", AxisScale::Linear, 0.0, most.max(1.0));
+    let curves = [("b", calibration.outcomes()), ("b, by value", calibration.outcomes_by_value())];
+    let curves = curves.map(|(name, outcomes)| (name, rolling_means(&outcomes, CALIBRATION.counted)));
+    let points = || curves.iter().flat_map(|(_, curve)| curve);
+    let most = points().map(|point| point[0]).fold(1.0, f64::max);
+    let least = points().map(|point| point[1]).fold(80.0, f64::min);
+    let x = Axis::new("structures with a bound", AxisScale::Linear, 0.0, most);
     let y = Axis::new("atoms below their bound (%)", AxisScale::Linear, (least - 2.0).max(0.0), 101.0);
     let promised = 100.0 * CALIBRATION.level;
     let mut panel = Panel::new(place, x, y);
-    panel.line([[0.0, promised], [most.max(1.0), promised]], Colour::GREY.dashed(0.7));
-    if curve.is_empty() {
+    panel.line([[0.0, promised], [most, promised]], Colour::GREY.dashed(0.7));
+    if points().next().is_none() {
         panel.placeholder("no label has tested a bound yet");
     }
-    panel.line(curve.clone(), Colour::VERMILLION.line(1.3));
+    for ((_, curve), colour) in curves.iter().zip([Colour::VERMILLION, Colour::BLUE]) {
+        panel.line(curve.clone(), colour.line(1.3));
+    }
     panel.panel_letter('b');
     panel.draw(figure);
-    for [number, share] in curve {
-        numbers.push(&["b".to_owned(), String::new(), String::new(), number.to_string(), csv::number(share)]);
+    for (name, curve) in curves {
+        for [number, share] in curve {
+            let empty = String::new;
+            numbers.push(&[name.to_owned(), empty(), empty(), number.to_string(), csv::number(share)]);
+        }
     }
 }
 

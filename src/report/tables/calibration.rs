@@ -6,14 +6,19 @@ use super::{PageTable, count, percent, real, text};
 use crate::output::range;
 use crate::wording;
 
-/// The bounds of all bins with data.
-pub fn bounds(name: &'static str, map: &CalibrationMap) -> PageTable {
+/// The bounds from labels as found, of all bins with data.
+pub fn found(summary: &CalibrationSummary) -> PageTable {
+    bounds("error-bounds", &summary.found)
+}
+
+fn bounds(name: &'static str, map: &CalibrationMap) -> PageTable {
     let caption = format!(
         "Bounds of the force error |F_{{model}} − F_{{label}}| by γ_{{nbr}} under the original mixture, a rolling conformal map: {:.0} % of the \
          errors of the next structure are expected to be below. Structures are the units, and their atoms in a bin share their weight. The \
          bound follows from the newest {} structures of a bin, and needs {}. Held: mean share of a structure’s atoms whose error was not above \
          the bound from before its label came, over the newest structures with a bound. Level in force: the level that has made bounds hold \
-         as often as they should. Of all bins together: {}.",
+         as often as they should. In use: the bounds of the bin count for structures without a label; where labels by value are more recent, or \
+         the only ones, theirs do. Of all bins together: {}.",
         100.0 * map.level,
         map.window_structures,
         map.least_structures,
@@ -28,11 +33,22 @@ pub fn bounds(name: &'static str, map: &CalibrationMap) -> PageTable {
         "held (%)",
         "tested by",
         "level in force (%)",
+        "in use",
     ];
     let mut table = PageTable::new(name, &caption, &titles);
     let several = map.elements().len() > 1;
     for bin in map.bins.iter().filter(|bin| several || bin.element.is_none()) {
-        let CalibrationBin { element, above, up_to, structures, bound, mean, level_in_force, coverage } = bin;
+        let CalibrationBin {
+            element,
+            above,
+            up_to,
+            structures,
+            bound,
+            mean,
+            level_in_force,
+            coverage,
+            in_use,
+        } = bin;
         table.rows.push(vec![
             text(range(*above, *up_to)),
             text(element.as_deref().unwrap_or("all")),
@@ -42,6 +58,7 @@ pub fn bounds(name: &'static str, map: &CalibrationMap) -> PageTable {
             percent(coverage.map(|found| found.share)),
             count(coverage.map_or(0, |found| found.structures as u64)),
             percent(Some(*level_in_force)),
+            text(if *in_use { "yes" } else { "no" }),
         ]);
     }
     table

@@ -14,12 +14,13 @@ use crate::wording::comparison::{intervals, larger, probability};
 const INTERVAL: &str = "95 %";
 
 /// All tables of the comparison. Those without rows are left out later.
-pub fn all(comparison: &WalkComparison) -> [PageTable; 7] {
+pub fn all(comparison: &WalkComparison) -> [PageTable; 8] {
     [
         pairs(comparison),
         tests(&comparison.pairs),
         unpaired(&comparison.pairs),
         groups(comparison),
+        group_errors(comparison),
         ranks(comparison),
         areas(comparison),
         elements(comparison),
@@ -99,14 +100,11 @@ fn unpaired(pairs: &PairedErrors) -> PageTable {
         return table;
     }
     table.rows.extend(rows.map(|(name, number)| vec![text(name), count(number)]));
-    let ranges = [
-        ("median force MAE of biased candidates between (eV/Å)", pairs.force_mae.biased_between),
-        ("median force MAE of control frames between (eV/Å)", pairs.force_mae.control_between),
-    ];
-    for (name, range) in ranges {
-        if let Some(range) = range {
-            table.rows.push(vec![text(name), text(wording::median_range(range, 3))]);
-        }
+    for (error, sides) in wording::failure_ranges(pairs) {
+        let row = |(side, range): (&str, String)| {
+            vec![text(format!("median of the {side} side between: {}", error.name)), text(range)]
+        };
+        table.rows.extend(sides.into_iter().map(row));
     }
     table
 }
@@ -115,25 +113,14 @@ fn groups(comparison: &WalkComparison) -> PageTable {
     let caption = format!(
         "Labelled structures of biased and control walks. Matched, those of the pairs; pooled, all, with a partner or without. Failed, \
          structures of the same kind whose labels failed: their errors are unknown. T, mean kinetic temperature of the structures (a strong \
-         bias heats). Medians, of the MAE over structures and of |ΔF| = |F_{{model}} − F_{{label}}| over atoms. Pooled: {}.",
-        intervals(&comparison.pooled.all.units, comparison)
+         bias heats). The queue chose {} of all {} structures by value; these are no random sample of what was found. {} label jobs are \
+         unfinished.",
+        comparison.chosen_by_value, comparison.sampled_structures, comparison.unfinished
     );
-    let titles = [
-        "",
-        "structures",
-        "failed",
-        "seed structures",
-        "walks",
-        "T (K)",
-        "V/V_{0}",
-        "MAE (eV Å^{−1})",
-        INTERVAL,
-        "|ΔF| (eV Å^{−1})",
-        INTERVAL,
-    ];
+    let titles = ["", "structures", "failed", "seed structures", "walks", "T (K)", "V/V_{0}"];
     let mut table = PageTable::new("comparison", &caption, &titles);
     for (name, group) in wording::groups(comparison) {
-        let mut row = vec![
+        table.rows.push(vec![
             text(name),
             count(group.structures),
             count(group.failed),
@@ -141,9 +128,31 @@ fn groups(comparison: &WalkComparison) -> PageTable {
             count(group.units.walks as u64),
             real(group.mean_temperature, 0),
             real(group.mean_relative_volume, 3),
-        ];
-        row.extend(cells(&group.median_force_mae, 1.0, 3));
+        ]);
+    }
+    table
+}
+
+/// The errors of each group.
+fn group_errors(comparison: &WalkComparison) -> PageTable {
+    let caption = format!(
+        "Median errors of the groups of the table before: over structures as for the pairs, and of |ΔF| = |F_{{model}} − F_{{label}}| over atoms. \
+         Last column, the range of the median for any errors of the structures whose labels failed. Pooled: {}.",
+        intervals(&comparison.pooled.all.units, comparison)
+    );
+    let titles = ["", "error", "median", INTERVAL, "with failed labels"];
+    let mut table = PageTable::new("comparison-errors", &caption, &titles);
+    for (name, group) in wording::groups(comparison) {
+        for (error, median) in wording::group_errors(group) {
+            let mut row = vec![text(name), text(error.name)];
+            row.extend(cells(&median, error.factor, error.digits));
+            let between = group.median_force_mae_between.filter(|_| error.key == "force_mae");
+            row.push(text(between.map_or(String::new(), |range| wording::median_range(range, 1.0, 3))));
+            table.rows.push(row);
+        }
+        let mut row = vec![text(name), text("|ΔF| of atoms (eV/Å)")];
         row.extend(cells(&group.median_error, 1.0, 3));
+        row.push(text(""));
         table.rows.push(row);
     }
     table
@@ -152,7 +161,7 @@ fn groups(comparison: &WalkComparison) -> PageTable {
 /// How well both grades rank the errors of each group.
 fn ranks(comparison: &WalkComparison) -> PageTable {
     let caption = format!(
-        "How well the grades under the original mixture rank the force errors of atoms, in the groups of the table before: Spearman’s ρ, and \
+        "How well the grades under the original mixture rank the force errors of atoms, in the same groups: Spearman’s ρ, and \
          ROC-AUC for errors above {LARGE_FORCE_ERROR} eV Å^{{−1}}. No interval where fewer than {MIN_UNITS} of the resampled units have such \
          an error."
     );
@@ -173,7 +182,7 @@ fn ranks(comparison: &WalkComparison) -> PageTable {
 fn areas(comparison: &WalkComparison) -> PageTable {
     let caption = format!(
         "ROC-AUC of γ_{{nbr}} under the original mixture as a test for force errors above a threshold, for each threshold with errors on \
-         both sides, in the groups of the table of medians. No interval where fewer than {MIN_UNITS} of the resampled units have such an \
+         both sides, in the same groups. No interval where fewer than {MIN_UNITS} of the resampled units have such an \
          error."
     );
     let titles = [

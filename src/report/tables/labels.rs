@@ -10,7 +10,8 @@ use crate::output::range;
 /// Correlation of grades and errors.
 pub fn correlations(statistics: &LabelStatistics) -> PageTable {
     let caption = format!(
-        "Force error |F_{{model}} − F_{{label}}| and the grades under the original mixture: mean error, Spearman’s ρ between grade and \
+        "Force error |F_{{model}} − F_{{label}}| and the grades under the original mixture, of all labelled structures (biased walks and \
+         their controls, with intervals, are in the tables before): mean error, Spearman’s ρ between grade and \
          error, and ROC-AUC of the grade as a test for errors above {LARGE_FORCE_ERROR} eV Å^{{−1}}."
     );
     let titles = [
@@ -27,22 +28,18 @@ pub fn correlations(statistics: &LabelStatistics) -> PageTable {
         "sampled atoms",
     ];
     let mut table = PageTable::new("correlations", &caption, &titles);
-    for (name, grades) in
-        [("all", &statistics.all), ("biased", &statistics.biased), ("control", &statistics.control)]
-    {
-        let (gamma, nbr) = (&grades.gamma, &grades.gamma_nbr);
-        if gamma.atoms() > 0 {
-            let mut row = vec![
-                text(name),
-                count(grades.structures),
-                count(gamma.atoms()),
-                real(gamma.mean(), 3),
-                percent(gamma.fraction_above(1.0)),
-                percent(nbr.fraction_above(1.0)),
-            ];
-            row.extend(ranking(grades));
-            table.rows.push(row);
-        }
+    let grades = &statistics.all;
+    if grades.gamma.atoms() > 0 {
+        let mut row = vec![
+            text("all"),
+            count(grades.structures),
+            count(grades.gamma.atoms()),
+            real(grades.gamma.mean(), 3),
+            percent(grades.gamma.fraction_above(1.0)),
+            percent(grades.gamma_nbr.fraction_above(1.0)),
+        ];
+        row.extend(ranking(grades));
+        table.rows.push(row);
     }
     table
 }

@@ -17,7 +17,7 @@ export function comparison({ biased_against_control: compared, large }) {
     element("p", {}, "Matched: a labelled candidate of a biased walk and the labelled frame of its control walk at the same step. Pooled: all "
       + "labelled structures, with a partner or without."),
     element("ul", {}, compared.notes.map((note) => element("li", {}, statement(note)))),
-    pairs.counts.pairs > 0 && pairTable(pairs, shown.errors), ranges(pairs), groupTable(groups),
+    pairs.counts.pairs > 0 && pairTable(pairs, shown.errors), ranges(pairs, shown.errors), groupTable(groups, shown.errors),
     rankTable(groups, thresholds.indexOf(large), large), areas(both, thresholds), elementTable(both, large));
 }
 
@@ -43,19 +43,28 @@ function pairTable(pairs, errors) {
   return table("Errors over the pairs", columns, rows);
 }
 
-/** What the errors of failed labels could change. */
-function ranges({ force_mae: { biased_between: biased, control_between: control } }) {
-  const range = ([low, high]) => (high == null ? `at least ${decimals(low, 3)}` : `${decimals(low, 3)} to ${decimals(high, 3)}`);
-  const lines = [["biased", biased], ["control", control]].filter(([, between]) => between)
-    .map(([name, between]) => `${name} ${range(between)} eV/Å`);
-  return lines.length > 0 && element("p", {}, `Median of the force MAE, whatever the errors of failed labels: ${lines.join("; ")}.`);
+/** A range of a median whatever the errors of failed labels are. */
+function between([low, high], digits, factor) {
+  return high == null ? `at least ${decimals(factor * low, digits)}` : `${decimals(factor * low, digits)} to ${decimals(factor * high, digits)}`;
 }
 
-function groupTable(groups) {
+/** What the errors of failed labels could change. */
+function ranges(pairs, errors) {
+  const sides = ({ key, digits, factor }) => ["biased", "control"].map((side) => [side, pairs[key][`${side}_between`]])
+    .filter(([, range]) => range).map(([side, range]) => `${side} ${between(range, digits, factor)}`);
+  const lines = errors.filter(({ key }) => pairs[key].pairs > 0).map((error) => [error.name, sides(error)])
+    .filter(([, of]) => of.length > 0).map(([name, of]) => `${name} ${of.join(", ")}`);
+  return lines.length > 0 && element("p", {}, `Medians over the pairs for any errors of failed labels: ${lines.join("; ")}.`);
+}
+
+function groupTable(groups, errors) {
+  const inGroups = errors.filter(({ group_key: key }) => key != null && groups.some(([, group]) => group[key].value != null));
   const columns = [["structures"], ["number", true], ["failed", true], ["seed structures", true], ["walks", true], ["mean T (K)", true],
-    ["mean V/V₀", true], ["median MAE (eV/Å)", true]];
+    ["mean V/V₀", true], ...inGroups.map(({ name }) => [`median ${name}`, true]), ["median MAE for any errors of failed", true]];
   const rows = groups.map(([name, group]) => [name, whole(group.structures), whole(group.failed), whole(group.units.seed_structures),
-    whole(group.units.walks), decimals(group.mean_temperature, 0), decimals(group.mean_relative_volume, 3), estimate(group.median_force_mae, 3)]);
+    whole(group.units.walks), decimals(group.mean_temperature, 0), decimals(group.mean_relative_volume, 3),
+    ...inGroups.map(({ group_key: key, digits, factor }) => estimate(group[key], digits, factor)),
+    group.median_force_mae_between ? between(group.median_force_mae_between, 3, 1) : "–"]);
   return table("Groups of structures", columns, rows);
 }
 

@@ -71,6 +71,8 @@ impl FromRow for FinishedStructure {
         CANDIDATE.verify(row, Names::Joined)?;
         Ok(Self {
             decision: row.get("candidate__decision")?,
+            walk: row.get("candidate__walk")?,
+            seed_structure: row.get("candidate__seed_structure")?,
             labelled: row.get::<String>("job_state")? == "labelled",
             gamma: row.get("candidate__original_gamma")?,
             relative_volume: row.get("candidate__relative_volume")?,
@@ -100,17 +102,20 @@ impl FromRow for QueuedStructure {
 }
 
 impl Store {
-    /// Structures whose label jobs of this protocol are finished and whose walks had this version of the potential, newest
-    /// first, at most `limit`.
+    /// Structures whose label jobs of this protocol are finished and whose walks had this version of the potential (`None`: any),
+    /// newest first, at most `limit`.
     pub async fn finished_structures(
         &self,
         protocol: ContentHash,
-        version: u32,
+        version: Option<u32>,
         limit: u32,
     ) -> Result<Vec<FinishedStructure>> {
         let mut transaction = self.database.begin_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
-        let walks = walk_conditions::versions(&mut transaction).await?.walks_of(version);
+        let walks = match version {
+            Some(version) => walk_conditions::versions(&mut transaction).await?.walks_of(version),
+            None => 0..i64::MAX,
+        };
         let found = query(FINISHED).bind(protocol).bind(walks.start).bind(walks.end).bind(limit);
         let found = found.fetch_all(&mut transaction).await?;
         transaction.commit().await?;

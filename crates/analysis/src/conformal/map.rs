@@ -16,13 +16,24 @@ pub struct GradedError<G> {
     pub group: G,
 }
 
-/// How often bounds held.
+/// How often bounds held for the newest structures.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RollingCoverage {
-    /// Mean share of a structure's atoms whose error was not above the bound.
+    /// Mean share of a structure's atoms with a bound whose error was not above it.
     pub share: f64,
-    /// Number of structures.
+    /// Number of structures with a bound for any of their atoms.
     pub structures: usize,
+    /// Mean share of a structure's atoms without a bound, over all structures since the oldest of these.
+    pub unbounded: f64,
+}
+
+/// What a structure told of the bounds from before it came.
+#[derive(Clone, Copy, Debug)]
+struct StructureOutcome {
+    /// Share of its atoms with a bound whose error was not above it; `None` if none had one.
+    held: Option<f64>,
+    /// Share of its atoms without a bound.
+    unbounded: f64,
 }
 
 /// A bound of the error for each bin of the grade. A group has bounds of its own in the bins where it has enough structures, and
@@ -33,8 +44,8 @@ pub struct ConformalMap<G> {
     bins: Bins,
     /// By group (`None`: all atoms) and bin.
     windows: BTreeMap<(Option<G>, usize), ConformalWindow>,
-    /// The covered share of each structure with a bound, in the order in which they came.
-    outcomes: Vec<f64>,
+    /// Of each structure, from the first with a bound on.
+    outcomes: Vec<StructureOutcome>,
     structures: u64,
 }
 
@@ -65,21 +76,16 @@ impl<G: Ord + Clone> ConformalMap<G> {
         self.sufficient(grade, group)?.bound()
     }
 
-    /// The expected error of an atom with this grade. `None` with too few structures in its bin.
-    pub fn expected(&self, grade: f64) -> Option<f64> {
-        self.sufficient(grade, None)?.mean()
+    /// The errors of all atoms in a bin. `None` with too few structures.
+    pub fn window(&self, bin: usize) -> Option<&ConformalWindow> {
+        self.windows.get(&(None, bin)).filter(|window| window.is_sufficient())
     }
 
-    /// Compares the next structure with the bounds, then adds it. Atoms whose grade or error is not finite are left out.
-    pub fn learn(&mut self, atoms: &[GradedError<G>]) {
+    /// Compares the next structure with the bounds, then adds it. Atoms whose grade or error is not finite are left out. `number`: its
+    /// place in the order of all structures, of this map and of others; it rises.
+    pub fn learn(&mut self, number: u64, atoms: &[GradedError<G>]) {
         let finite = |atom: &&GradedError<G>| atom.grade.is_finite() && atom.error.is_finite();
-        let bound = |atom: &GradedError<G>| self.bound(atom.grade, Some(&atom.group));
-        let compared = atoms.iter().filter(finite);
-        let held: Vec<_> = compared.filter_map(|atom| Some(atom.error <= bound(atom)?)).collect();
-        if !held.is_empty() {
-            let covered = held.iter().filter(|held| **held).count();
-            self.outcomes.push(covered as f64 / held.len() as f64);
-        }
+        self.compare(&atoms.iter().filter(finite).collect::<Vec<_>>());
         let mut errors: BTreeMap<_, Vec<f64>> = BTreeMap::new();
         for atom in atoms.iter().filter(finite) {
             let bin = self.bins.index_of(atom.grade);
@@ -90,21 +96,48 @@ impl<G: Ord + Clone> ConformalMap<G> {
         self.structures += u64::from(!errors.is_empty());
         for (key, errors) in errors {
             let window = self.windows.entry(key);
-            window.or_insert_with(|| ConformalWindow::new(self.settings)).learn(&errors);
+            window.or_insert_with(|| ConformalWindow::new(self.settings)).learn(number, &errors);
+        }
+    }
+
+    /// Compares the atoms of a structure with their bounds.
+    fn compare(&mut self, atoms: &[&GradedError<G>]) {
+        let bound = |atom: &GradedError<G>| self.bound(atom.grade, Some(&atom.group));
+        let held: Vec<_> = atoms.iter().filter_map(|atom| Some(atom.error <= bound(atom)?)).collect();
+        let covered = held.iter().filter(|held| **held).count();
+        let outcome = StructureOutcome {
+            held: (!held.is_empty()).then(|| covered as f64 / held.len() as f64),
+            unbounded: 1.0 - held.len() as f64 / atoms.len() as f64,
+        };
+        if !atoms.is_empty() && (outcome.held.is_some() || !self.outcomes.is_empty()) {
+            self.outcomes.push(outcome);
         }
     }
 
     /// How often bounds held for the newest structures, each compared with those from before it came. `None` without any.
     pub fn coverage(&self) -> Option<RollingCoverage> {
-        let counted = &self.outcomes[self.outcomes.len().saturating_sub(self.settings.counted)..];
-        let structures = counted.len();
-        (structures > 0)
-            .then(|| RollingCoverage { share: counted.iter().sum::<f64>() / structures as f64, structures })
+        let (mut structures, mut covered, mut all, mut unbounded) = (0, 0.0, 0, 0.0);
+        for outcome in self.outcomes.iter().rev() {
+            all += 1;
+            unbounded += outcome.unbounded;
+            if let Some(held) = outcome.held {
+                structures += 1;
+                covered += held;
+            }
+            if structures == self.settings.counted {
+                break;
+            }
+        }
+        (structures > 0).then(|| RollingCoverage {
+            share: covered / structures as f64,
+            structures,
+            unbounded: unbounded / f64::from(all),
+        })
     }
 
     /// The covered share of each structure with a bound, in the order in which they came.
-    pub fn outcomes(&self) -> &[f64] {
-        &self.outcomes
+    pub fn outcomes(&self) -> Vec<f64> {
+        self.outcomes.iter().filter_map(|outcome| outcome.held).collect()
     }
 
     /// The windows with data: group (`None`: all atoms), index of the bin.

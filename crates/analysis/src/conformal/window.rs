@@ -13,13 +13,14 @@ pub struct ConformalWindow {
     settings: ConformalSettings,
     /// By ascending error.
     ascending: Vec<WindowError>,
-    /// Numbers of the oldest structure in the window and of the next one to come.
-    oldest: u64,
-    next: u64,
+    /// Numbers of the structures in the window, ascending.
+    numbers: VecDeque<u64>,
     /// 1 − the level in force.
     miscoverage: f64,
     /// Shares of the atoms of the newest structures that were not above the bound.
     outcomes: VecDeque<f64>,
+    /// See [`Self::threshold`].
+    threshold: Option<f64>,
 }
 
 /// An error in the window.
@@ -29,7 +30,7 @@ struct WindowError {
     /// 1 / number of atoms of its structure in this bin.
     weight: f64,
     /// Number of its structure.
-    structure: u64,
+    number: u64,
 }
 
 impl ConformalWindow {
@@ -38,16 +39,28 @@ impl ConformalWindow {
         Self {
             settings,
             ascending: Vec::new(),
-            oldest: 0,
-            next: 0,
+            numbers: VecDeque::new(),
             miscoverage: 1.0 - settings.level,
             outcomes: VecDeque::new(),
+            threshold: None,
         }
     }
 
     /// Number of structures in the window.
     pub fn structures(&self) -> usize {
-        (self.next - self.oldest) as usize
+        self.numbers.len()
+    }
+
+    /// Whether more than half of its structures are older than those of `other`, which has as many as it can have.
+    pub fn is_outdated_by(&self, other: &Self) -> bool {
+        let is_full = other.structures() == other.capacity();
+        let middle = self.numbers.get(self.structures() / 2);
+        is_full && middle.zip(other.numbers.front()).is_some_and(|(middle, oldest)| middle < oldest)
+    }
+
+    /// Largest number of structures.
+    fn capacity(&self) -> usize {
+        self.settings.window.max(self.settings.least())
     }
 
     /// Whether the window has enough structures for a bound.
@@ -80,8 +93,8 @@ impl ConformalWindow {
     }
 
     /// Adds the errors of the next structure's atoms in this bin, which must be finite, after comparing them with the bound from
-    /// before. Without errors the structure is not in this bin.
-    pub fn learn(&mut self, errors: &[f64]) {
+    /// before. Without errors the structure is not in this bin. `number`: its place in the order of all structures; it rises.
+    pub fn learn(&mut self, number: u64, errors: &[f64]) {
         if errors.is_empty() {
             return;
         }
@@ -97,22 +110,24 @@ impl ConformalWindow {
                 self.outcomes.drain(..more);
             }
         }
-        let (structure, weight) = (self.next, 1.0 / errors.len() as f64);
-        self.next += 1;
-        self.ascending.extend(errors.iter().map(|error| WindowError { error: *error, weight, structure }));
-        if self.structures() > settings.window.max(settings.least()) {
-            let oldest = self.oldest;
-            self.ascending.retain(|entry| entry.structure != oldest);
-            self.oldest += 1;
+        let weight = 1.0 / errors.len() as f64;
+        self.numbers.push_back(number);
+        self.ascending.extend(errors.iter().map(|error| WindowError { error: *error, weight, number }));
+        if self.structures() > self.capacity()
+            && let Some(oldest) = self.numbers.pop_front()
+        {
+            self.ascending.retain(|entry| entry.number != oldest);
         }
         self.ascending.sort_by(|a, b| a.error.total_cmp(&b.error));
+        self.threshold = self.is_sufficient().then(|| self.quantile());
     }
 
-    /// The bound, infinite if the level in force is above what the structures support.
+    /// The bound, infinite if the level in force is above what the structures support. `None` with too few structures.
     pub(super) fn threshold(&self) -> Option<f64> {
-        if !self.is_sufficient() {
-            return None;
-        }
+        self.threshold
+    }
+
+    fn quantile(&self) -> f64 {
         let structures = self.structures() as f64;
         let needed = self.level() * (structures + 1.0) - SAME_WEIGHT * structures;
         let mut below = 0.0;
@@ -120,6 +135,6 @@ impl ConformalWindow {
             below += entry.weight;
             below >= needed
         };
-        Some(self.ascending.iter().find(reaches).map_or(f64::INFINITY, |entry| entry.error))
+        self.ascending.iter().find(reaches).map_or(f64::INFINITY, |entry| entry.error)
     }
 }

@@ -7,7 +7,7 @@ use atoms::Species;
 use serde::Serialize;
 
 use super::super::LARGE_FORCE_ERROR;
-use super::super::frames::{ComparedAtom, ComparedFrame, mean};
+use super::super::frames::{ComparedAtom, ComparedFrame, FrameErrors, mean};
 use super::ranked_atoms::RankedAtoms;
 use super::units::{
     ConfidenceEstimate, MIN_UNITS, NumberedUnits, ResamplingUnits, median, median_range, sorted_values,
@@ -33,6 +33,10 @@ pub struct ComparedGroup {
     pub median_force_mae: ConfidenceEstimate,
     /// The range of that median, whatever the errors of the failed structures are; without an upper end if they are too many.
     pub median_force_mae_between: Option<(f64, Option<f64>)>,
+    /// Median over the structures of |E_model − E_label| per atom without the offsets of the elements, eV.
+    pub median_energy: ConfidenceEstimate,
+    /// Median over the structures of the root mean square error of the stress, eV/Å³.
+    pub median_stress: ConfidenceEstimate,
     /// Number of atoms in the sample for the following estimates.
     pub sampled_atoms: u64,
     /// Number of atoms in the sample for their intervals.
@@ -97,24 +101,28 @@ impl ComparedGroup {
     ) -> Self {
         let places = frames.iter().map(|frame| frame.place).chain(atoms.iter().map(|atom| atom.place));
         let units = NumberedUnits::new(places);
-        let known =
-            frames.iter().filter_map(|frame| Some((frame.errors.force_mae?, units.unit(frame.place))));
-        let force_mae = sorted_values(known.clone());
-        let mut sorted: Vec<_> = known.map(|(error, _)| error).collect();
-        sorted.sort_by(f64::total_cmp);
+        let known = |of: fn(&FrameErrors) -> Option<f64>| {
+            frames.iter().filter_map(move |frame| Some((of(&frame.errors)?, frame.place)))
+        };
+        let of_structures: [fn(&FrameErrors) -> Option<f64>; 3] =
+            [|errors| errors.force_mae, |errors| errors.energy, |errors| errors.stress];
+        let columns =
+            of_structures.map(|of| sorted_values(known(of).map(|(error, place)| (error, units.unit(place)))));
+        let mut force_maes: Vec<_> = known(of_structures[0]).map(|(error, _)| error).collect();
+        force_maes.sort_by(f64::total_cmp);
 
         let of_units: Vec<_> = atoms.iter().map(|atom| (*atom, units.unit(atom.place))).collect();
         let elements: BTreeSet<Species> = atoms.iter().map(|atom| atom.species).collect();
         let whole = GroupAtoms::new(&of_units, &elements);
         let drawn = GroupAtoms::new(&thinned(&of_units), &elements);
         let values = |of: &GroupAtoms, multiplicities: &[u32]| {
-            let mut values = vec![median(&force_mae, multiplicities)];
-            values.extend(of.values(multiplicities));
-            values
+            let of_structures = columns.iter().map(|column| median(column, multiplicities));
+            of_structures.chain(of.values(multiplicities)).collect::<Vec<_>>()
         };
         let estimates = units.estimates(bootstrap, |all| values(&whole, all), |draw| values(&drawn, draw));
         let mut estimates = estimates.into_iter();
-        let median_force_mae = estimates.next().unwrap_or_default();
+        let mut next = || estimates.next().unwrap_or_default();
+        let [median_force_mae, median_energy, median_stress] = [next(), next(), next()];
         let (median_error, gamma, gamma_nbr) = rankings(&mut estimates, &drawn.all, &ERROR_THRESHOLDS);
         let element = |(element, (all, drawn)): (&Species, (&RankedAtoms, &RankedAtoms))| {
             let (median_error, gamma, gamma_nbr) = rankings(&mut estimates, drawn, &[LARGE_FORCE_ERROR]);
@@ -128,7 +136,9 @@ impl ComparedGroup {
             mean_temperature: mean(frames.iter().map(|frame| frame.temperature)),
             mean_relative_volume: mean(frames.iter().map(|frame| frame.relative_volume)),
             median_force_mae,
-            median_force_mae_between: median_range(&sorted, failed).filter(|_| failed > 0),
+            median_force_mae_between: median_range(&force_maes, failed).filter(|_| failed > 0),
+            median_energy,
+            median_stress,
             sampled_atoms: whole.all.len() as u64,
             resampled_atoms: drawn.all.len() as u64,
             median_error,

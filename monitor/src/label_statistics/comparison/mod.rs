@@ -36,6 +36,10 @@ pub struct WalkComparison {
     pub structures: u64,
     /// Of them, those of the walks in the sample that the comparison is of: all, except in very large campaigns.
     pub sampled_structures: u64,
+    /// Of these, those that the queue chose by value: they are no random sample of what was found.
+    pub chosen_by_value: u64,
+    /// Label jobs of the protocol that wait or are in work, of all versions of the potential.
+    pub unfinished: u64,
     /// Their atoms with finite grades and errors.
     pub atoms: u64,
     /// Of them, those in the sample for ranks and medians.
@@ -90,9 +94,9 @@ impl WalkComparison {
         let matched_group = |origin: Origin| {
             let place = usize::from(origin == Origin::Control);
             let of: Vec<_> = matched.pairs.iter().map(|pair| pair[place]).collect();
-            let steps: HashSet<_> = of.iter().map(|frame| (frame.place.walk, frame.step)).collect();
+            let places: HashSet<_> = of.iter().map(|frame| (frame.place.walk, frame.at)).collect();
             let is_in = |atom: &&ComparedAtom| {
-                atom.place.origin == origin && steps.contains(&(atom.place.walk, atom.step))
+                atom.place.origin == origin && places.contains(&(atom.place.walk, atom.at))
             };
             let atoms: Vec<_> = atoms.iter().copied().filter(is_in).collect();
             ComparedGroup::new(&of, &atoms, matched.failed(origin), bootstrap)
@@ -103,6 +107,8 @@ impl WalkComparison {
             rng_seed: bootstrap.seed,
             structures: frames.labelled_in_all(),
             sampled_structures: labelled.len() as u64,
+            chosen_by_value: labelled.iter().filter(|frame| frame.by_value).count() as u64,
+            unfinished: frames.unfinished,
             atoms: frames.atoms.total(),
             sampled_atoms: atoms.len() as u64,
             thresholds: ERROR_THRESHOLDS.to_vec(),

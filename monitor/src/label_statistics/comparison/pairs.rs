@@ -133,7 +133,7 @@ pub(super) fn match_frames(frames: &ComparedFrames) -> MatchedFrames<'_> {
     let mut places: BTreeMap<(u32, u64), [Option<LabelOutcome>; 2]> = BTreeMap::new();
     let side = |origin: Origin| usize::from(origin == Origin::Control);
     for frame in frames.labelled() {
-        let sides = places.entry((frame.place.walk, frame.step)).or_default();
+        let sides = places.entry((frame.place.walk, frame.at.1)).or_default();
         sides[side(frame.place.origin)].get_or_insert(LabelOutcome::Labelled(frame));
     }
     for failed in frames.failed() {
@@ -195,7 +195,7 @@ impl PairedErrors {
             Some(PairPoint {
                 seed_structure: biased.place.seed_structure,
                 walk: biased.place.walk,
-                step: biased.step,
+                step: biased.at.1,
                 biased: biased.errors.force_mae?,
                 control: control.errors.force_mae?,
             })
@@ -213,7 +213,7 @@ impl PairedErrors {
 }
 
 impl PairedQuantity {
-    fn new(
+    pub(super) fn new(
         matched: &MatchedFrames,
         units: &NumberedUnits,
         of: fn(&FrameErrors) -> Option<f64>,
