@@ -113,6 +113,7 @@ impl LoadedCampaign {
             combine_errors(path, grades, labels)?;
         warnings.extend(loader.suspicious_grades(&model, &artifact, &seeds.valid, training.as_ref())?);
         warnings.extend(loader.suspicious_seed_structures(&seeds));
+        warnings.extend(loader.suspicious_held_out(&seeds.valid));
         let pair_ranges = pair_ranges(&config, &seeds.valid);
         warnings.extend(loader.repulsion_in_bonds(&pair_ranges));
         let (known, suspicious) = loader.known_structures(&model.shared())?;
