@@ -79,14 +79,14 @@ impl<V: Vector> WeightGradient<V> {
         Instructions::best().run(OuterProducts { sums: self, slots, x, y });
     }
 
-    /// Adds other sums.
-    pub fn add(&mut self, other: &Self) {
-        self.sums.iter_mut().zip(&other.sums).for_each(|(sum, x)| sum.add(x));
+    /// All sums.
+    pub fn flat(&self) -> &[V::Number] {
+        V::flat(&self.sums)
     }
 
-    /// Sets all to zero.
-    pub fn clear(&mut self) {
-        self.sums.fill(V::ZERO);
+    /// The same.
+    pub fn flat_mut(&mut self) -> &mut [V::Number] {
+        V::flat_mut(&mut self.sums)
     }
 
     /// `[type, input, output]`
