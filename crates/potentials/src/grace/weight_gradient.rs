@@ -79,6 +79,11 @@ impl<V: Vector> WeightGradient<V> {
         Instructions::best().run(OuterProducts { sums: self, slots, x, y });
     }
 
+    /// Adds other sums.
+    pub fn add(&mut self, other: &Self) {
+        self.sums.iter_mut().zip(&other.sums).for_each(|(sum, x)| sum.add(x));
+    }
+
     /// All sums.
     pub fn flat(&self) -> &[V::Number] {
         V::flat(&self.sums)

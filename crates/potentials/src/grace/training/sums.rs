@@ -88,14 +88,16 @@ impl WeightSums {
 
     /// All arrays, in a fixed order.
     fn slices(&self) -> Vec<&[f64]> {
-        let of_layer = |sums: &'_ LayerSums| {
-            let LayerSums { steps, block, norm, tables, factors } = sums;
-            let maps = steps.iter().flatten().chain([block]).map(WeightGradient::flat);
-            let rows = tables.iter().chain(factors).map(|row| Double::flat(row));
-            maps.chain(rows).chain([norm.as_slice()]).collect::<Vec<_>>()
-        };
-        let maps = self.perceptron.iter().map(WeightGradient::flat);
-        self.layers.iter().flat_map(of_layer).chain(maps).chain([self.shifts.as_slice()]).collect()
+        let Self { layers, perceptron, shifts } = self;
+        let mut all = Vec::new();
+        for LayerSums { steps, block, norm, tables, factors } in layers {
+            all.extend(steps.iter().flatten().chain([block]).map(WeightGradient::flat));
+            all.extend(tables.iter().chain(factors).map(|row| Double::flat(row)));
+            all.push(norm.as_slice());
+        }
+        all.extend(perceptron.iter().map(WeightGradient::flat));
+        all.push(shifts.as_slice());
+        all
     }
 
     /// The same arrays in the same order.
