@@ -390,7 +390,7 @@ pub fn selector_settings(config: &Config) -> SelectorSettings {
         max_per_seed_structure: collect.max_per_seed_structure.map(NonZeroU32::get),
         max_structures: config.max_structures(),
         max_steps_without_structure: config.stop.max_steps_without_structure.map(u64::from),
-        stop_groups: config.stop.walks.clone(),
+        stop_groups: config.stop.walks.clone().unwrap_or_default(),
         control: campaign.control,
         control_share: campaign.control_share.get(),
         min_distances: guard.min_distances.clone(),

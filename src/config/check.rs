@@ -109,6 +109,7 @@ fn check_stop(config: &Config) -> Result<(), InvalidValue> {
 
 fn check_stop_walks(config: &Config) -> Result<(), InvalidValue> {
     let StopSection { walks, max_steps_without_structure, .. } = &config.stop;
+    let walks = walks.as_deref().unwrap_or_default();
     let names: Vec<_> = config.walks.iter().map(|group| group.name.as_str()).collect();
     if let Some(unknown) = walks.iter().find(|name| !names.contains(&name.as_str())) {
         let expected = match names.is_empty() {
@@ -117,12 +118,11 @@ fn check_stop_walks(config: &Config) -> Result<(), InvalidValue> {
         };
         return wrong("stop.walks", format!("\"{unknown}\""), expected);
     }
-    match max_steps_without_structure {
-        None if !walks.is_empty() => {
-            wrong("stop.walks", format!("{walks:?}"), "stop.max_steps_without_structure, which it belongs to")
-        }
-        _ => Ok(()),
+    if !walks.is_empty() && max_steps_without_structure.is_none() {
+        let expected = "stop.max_steps_without_structure, which it belongs to";
+        return wrong("stop.walks", walks.join(", "), expected);
     }
+    Ok(())
 }
 
 /// The length of the queue depends on the speed of the labellers, which is not reproducible.

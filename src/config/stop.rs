@@ -15,8 +15,7 @@ pub struct StopSection {
     pub max_steps_without_structure: Option<NonZeroU64>,
     /// Groups of `[[walks]]` whose steps and structures count for `max_steps_without_structure`, such as those at the conditions that
     /// the potential is for. Default: all.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub walks: Vec<String>,
+    pub walks: Option<Vec<String>>,
     /// Smallest relative fall of the force errors on held-out labels for each 100 labels that a version of the potential was
     /// trained on in addition. A version with less is the last, and no walk starts with it. Default: none.
     pub min_improvement: Option<Positive>,

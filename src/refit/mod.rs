@@ -33,7 +33,7 @@ pub use self::command::end_marked_when_alone;
 use self::cost::{CostMeter, RefitCost};
 use self::failure::RefitFailure;
 use self::judge::{ComparisonFigures, DataSets, EvaluationContext, SetFigures, load_version, refusal};
-use self::native::NativeTraining;
+use self::native::{NativeTraining, TrainingReport};
 use self::settings::{RefitSettings, RefitterConfig, TestSet};
 use self::training_set::{FrozenSet, LabelChoice, LabelFile, LabelFiles, kept};
 use crate::atomic_file::{AtomicFile, cannot_write};
@@ -367,11 +367,12 @@ impl Refit<'_> {
         let begin = (self.config.begin(), format!("version {}", self.config.begin_version()));
         let training = NativeTraining { begin, labels, output };
         let settings = (&self.config.settings, native);
-        let report = |line: String| (self.report)(format!("{what}: {line}"));
+        let progress = |line: String| (self.report)(format!("{what}: {line}"));
         let number = self.set.number;
-        let warn = |text: String| log_and_warn(format_args!("refit {number}: {what}: {text}"));
-        let (seed, tell): (_, (&dyn Fn(String), &dyn Fn(String))) = (self.config.rng_seed, (&report, &warn));
-        let trained = tokio::task::block_in_place(|| training.run(settings, seed, self.stop, tell))?;
+        let warning = |text: String| log_and_warn(format_args!("refit {number}: {what}: {text}"));
+        let report = TrainingReport { progress: &progress, warning: &warning };
+        let seed = self.config.rng_seed;
+        let trained = tokio::task::block_in_place(|| training.run(settings, seed, self.stop, report))?;
         Ok(trained.map(|summary| TrainingRecord {
             structures: Some(summary.structures),
             validation: Some(summary.validation),

@@ -33,6 +33,14 @@ pub struct NativeTraining<'a> {
     pub output: PathBuf,
 }
 
+/// Where what a training says goes, a line at a time.
+pub struct TrainingReport<'a> {
+    /// Where it is.
+    pub progress: &'a dyn Fn(String),
+    /// What the user should know of the data.
+    pub warning: &'a dyn Fn(String),
+}
+
 /// What a training was.
 #[derive(Clone, Debug)]
 pub struct TrainingSummary {
@@ -49,8 +57,7 @@ pub struct TrainingSummary {
 }
 
 impl NativeTraining<'_> {
-    /// Trains, or continues. `None` after a cancellation of `stop`. `report` is told where it is, `warn` what the user should know of
-    /// the data.
+    /// Trains, or continues. `None` after a cancellation of `stop`.
     ///
     /// # Errors
     /// Refused: a model that cannot be trained, labels that nothing can be trained on, a loss that is not finite. Failed: a full disk.
@@ -59,7 +66,7 @@ impl NativeTraining<'_> {
         (settings, native): (&RefitSettings, &NativeRefit),
         rng_seed: u64,
         stop: &CancellationToken,
-        (report, warn): (&dyn Fn(String), &dyn Fn(String)),
+        TrainingReport { progress: report, warning: warn }: TrainingReport<'_>,
     ) -> Result<Option<TrainingSummary>, RefitFailure> {
         let (begin, name) = self.begin;
         let model = TrainableGrace::load(&begin.path).map_err(RefitFailure::of_model)?;

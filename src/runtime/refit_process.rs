@@ -185,8 +185,9 @@ impl<'a> RefitProcess<'a> {
             && self.wait_until.is_none_or(|time| Instant::now() >= time)
             && schedule.is_due_beside_walks(self.refit, campaign_begin(store).await?, unix_milliseconds())
             && !is_another_running(store).await?
+            && let Err(why) = self.start()
         {
-            self.start()?;
+            self.try_again_later(&why);
         }
         Ok(())
     }
