@@ -113,6 +113,7 @@ impl LoadedCampaign {
             combine_errors(path, grades, labels)?;
         warnings.extend(loader.suspicious_grades(&model, &artifact, &seeds.valid, training.as_ref())?);
         warnings.extend(loader.suspicious_seed_structures(&seeds));
+        warnings.extend(loader.suspicious_held_out(&seeds.valid));
         let pair_ranges = pair_ranges(&config, &seeds.valid);
         warnings.extend(loader.repulsion_in_bonds(&pair_ranges));
         let (known, suspicious) = loader.known_structures(&model.shared())?;
@@ -389,6 +390,7 @@ pub fn selector_settings(config: &Config) -> SelectorSettings {
         max_per_seed_structure: collect.max_per_seed_structure.map(NonZeroU32::get),
         max_structures: config.max_structures(),
         max_steps_without_structure: config.stop.max_steps_without_structure.map(u64::from),
+        stop_groups: config.stop.walks.clone().unwrap_or_default(),
         control: campaign.control,
         control_share: campaign.control_share.get(),
         min_distances: guard.min_distances.clone(),

@@ -3,6 +3,8 @@
 use std::path::Path;
 use std::process::ExitCode;
 
+use atoms::FileError;
+
 use crate::config::ConfigError;
 
 /// How a command ended without a failure.
@@ -21,6 +23,8 @@ pub enum ExitStatus {
 pub enum CommandError {
     /// Wrong input or configuration: exit code 2.
     Input(String),
+    /// A file that the system cannot open or read: exit code 2. Where the file was read before, it is no wrong input.
+    Unreadable(String),
     /// Any other failure: exit code 1.
     Failed(String),
 }
@@ -58,7 +62,7 @@ impl CommandError {
     /// 2 or 1.
     pub fn exit_code(&self) -> ExitCode {
         ExitCode::from(match self {
-            Self::Input(_) => 2,
+            Self::Input(_) | Self::Unreadable(_) => 2,
             Self::Failed(_) => 1,
         })
     }
@@ -66,8 +70,17 @@ impl CommandError {
 
 impl std::fmt::Display for CommandError {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let (Self::Input(message) | Self::Failed(message)) = self;
+        let (Self::Input(message) | Self::Unreadable(message) | Self::Failed(message)) = self;
         f.write_str(message)
+    }
+}
+
+impl From<FileError> for CommandError {
+    fn from(error: FileError) -> Self {
+        match error.is_of_system() {
+            true => Self::Unreadable(error.to_string()),
+            false => Self::input(error),
+        }
     }
 }
 

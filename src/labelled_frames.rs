@@ -38,6 +38,20 @@ impl DataFile {
         Self { validation: true, ..self }
     }
 
+    /// Refuses a file for validation with the content of one to train with. `self` is for validation.
+    ///
+    /// # Errors
+    /// Such a file among `others`.
+    pub fn refuse_copy(&self, others: &[Self]) -> Result<(), CommandError> {
+        match others.iter().find(|other| other.hash == self.hash) {
+            Some(Self { file, .. }) => Err(CommandError::Input(format!(
+                "{}, a file of validation data, has the same content as {file}, a file of training data; expected other structures",
+                self.file
+            ))),
+            None => Ok(()),
+        }
+    }
+
     /// The same without the directory of the file.
     pub fn without_directory(self) -> Self {
         let name = Path::new(&self.file).file_name();
@@ -104,11 +118,11 @@ pub fn read_without_warning(
         counts[reader.file_index()] += 1;
         let (labelled, has_stress) = labelled_frame(frame, &file)?;
         stresses_left_out += u64::from(has_stress && labelled.stress.is_none());
-        frames.push(labelled);
+        frames.push(LabelledFrame { file: reader.file_index(), ..labelled });
     }
     let file = |(file, structures): (&StructureFile, u64)| -> Result<DataFile, CommandError> {
         let hash = file_hash::hash(&file.path).map_err(|error| {
-            CommandError::Input(format!("{}: cannot be read: {error}", file.path.display()))
+            CommandError::Unreadable(format!("{}: cannot be read: {error}", file.path.display()))
         })?;
         let name = file.path.display().to_string();
         Ok(DataFile { file: name, hash, structures, weight: file.weight, validation: false })

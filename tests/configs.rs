@@ -139,6 +139,31 @@ fn aluminium_runs_as_it_stands() {
     let frames = campaign(directory.path(), &config("aluminium.toml"), 24, 1.2);
     let mut potential = Eam::load_as(config("data/Al_mm.eam.fs"), EamStyle::FinnisSinclair).unwrap();
     check_labels(&frames, &mut potential);
+    check_loop(directory.path());
+}
+
+/// The errors of the forces on the hot crystal and the liquid fall with each version, and the summary shows those on all data sets.
+fn check_loop(directory: &Path) {
+    let here = directory.join("campaign").display().to_string();
+    let figures = |number: u32| -> Value {
+        let shown = succeed(directory, ["versions", &here, "show", &number.to_string(), "--json"]);
+        serde_json::from_str::<Value>(&shown).unwrap()["figures"]["sets"].take()
+    };
+    let sets: Vec<_> = (1..=3).map(figures).collect();
+    let names: Vec<_> = sets[0].as_array().unwrap().iter().map(|set| set["name"].as_str().unwrap()).collect();
+    assert_eq!((names.len(), names.iter().collect::<BTreeSet<_>>().len()), (7, 7), "{names:?}");
+    for name in ["hot", "liquid"] {
+        let error = |sets: &Value, model: &str| {
+            let set = sets.as_array().unwrap().iter().find(|set| set["name"] == name).unwrap();
+            set[model]["force_mae"].as_f64().unwrap()
+        };
+        let mut errors = vec![error(&sets[0], "first")];
+        errors.extend(sets.iter().map(|sets| error(sets, "version")));
+        assert!(errors.windows(2).all(|pair| pair[1] < pair[0]), "{name}: {errors:?}");
+    }
+    let summary =
+        succeed(directory, ["run", &config("aluminium.toml").display().to_string(), "--directory", &here]);
+    assert!(names.iter().all(|name| summary.contains(name)), "{names:?}\n{summary}");
 }
 
 #[test]

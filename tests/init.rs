@@ -198,3 +198,41 @@ fn the_recipes_of_the_first_campaign_work() {
     assert!(printed.starts_with("imported ") && printed.contains("of protocol 'potential'"), "{printed}");
     succeed(here, ["export", "own", "--output", "dataset.extxyz", "--imported"]);
 }
+
+/// The recipe of a warm start, with few training data, two seed structures and short walks.
+#[test]
+fn the_recipe_of_a_warm_start_works() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    prepare(here);
+    let known = read_extxyz(&config("data/al_eam_1l/seed_frames.extxyz")).unwrap();
+    write_frames(&here.join("known.extxyz"), &known[..20]);
+    succeed(here, ["calm", "build", "--model", "own/model.npz", "known.extxyz", "--output", "warm.npz"]);
+    let teacher = teacher();
+    let given = ["init", "own", "--model", "own/model.npz", "--artifact", "warm.npz", "--structures"];
+    let labels = ["seeds.extxyz", "--label", "potential", "--label-source", &teacher];
+    succeed(here, given.iter().chain(&labels));
+    let text = written(here);
+    assert!(text.contains("warm.npz\"") && !text.contains("\nupdate = \"never\""), "{text}");
+    let steps = "biased_steps = 15000";
+    assert!(text.contains(steps));
+    let text = text.replace(steps, "equilibration_steps = 20\nbiased_steps = 100");
+    let with_labels = |labels: u32| {
+        fs::write(here.join(CONFIG), format!("{text}\n[budget]\nlabels = {labels}\n")).unwrap();
+        succeed(here, ["run", "--in-process", CONFIG]);
+        let status: Value = serde_json::from_str(&succeed(here, ["status", "own", "--json"])).unwrap();
+        assert_eq!(status["finished"], true, "{status}");
+        let [found, imported] = ["accepted", "imported"].map(|key| status["candidates"][key].as_u64());
+        (found.unwrap(), imported.or(status["imported"].as_u64()))
+    };
+    // The first run creates the campaign, and the second goes on with what it knows.
+    let (before, _) = with_labels(1);
+    let printed = succeed(here, ["import", "own", "known.extxyz"]);
+    assert!(printed.starts_with("imported 20 "), "{printed}");
+    let (after, imported) = with_labels(4);
+    assert!(before == 1 && after > before && imported == Some(20), "{before} {after} {imported:?}");
+    succeed(here, ["export", "own", "--output", "dataset.extxyz", "--imported"]);
+    let frames = read_extxyz(&here.join("dataset.extxyz")).unwrap();
+    assert_eq!(frames.len() as u64, after + 20);
+    assert!(frames.iter().all(|frame| frame.labels().unwrap().forces.is_some()));
+}

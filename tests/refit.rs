@@ -1,5 +1,6 @@
 //! `calmwalk refitter`: trains, judges and registers a version of the potential, or refuses it.
 
+mod interruptions;
 mod wrong_data;
 
 use std::collections::BTreeSet;
@@ -8,7 +9,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Output, Stdio};
 
-use atoms::extxyz::Frame;
+use atoms::extxyz::{Frame, LabelKeys};
 use atoms::read_extxyz;
 use calm::Artifact;
 use potentials::grace::GraceModel;
@@ -332,6 +333,77 @@ fn no_label_of_a_held_out_seed_structure_is_trained_on() {
         left.into_iter().partition(|frame| text(frame, "seed_structure") == "vacancy");
     assert_eq!((ids(&training), ids(&held_out)), (ids(&of_vacancy), ids(&others)));
     assert!(training.iter().any(|frame| text(frame, "origin") == "control"));
+}
+
+/// A label that was pending when the training set was fixed judges the version, although its decision is an early one.
+#[test]
+fn labels_that_come_while_a_version_is_trained_judge_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    prepare(here);
+    succeed(here, ["export", "campaign", "--control", "--output", "all.extxyz"]);
+    let first = text(&read_extxyz(&here.join("all.extxyz")).unwrap()[0], "candidate_id");
+    // Excluded labels are in no set, and included ones in the next.
+    succeed(here, ["exclude", "campaign", &first, "--reason", "a test"]);
+    let include = format!(
+        "'{}' exclude '{}' '{first}' --undo && cp \"$CALMWALK_PARENT_MODEL\" model.npz",
+        env!("CARGO_BIN_EXE_calmwalk"),
+        here.join("campaign").display()
+    );
+    let output = refit(here, &settings(here, "campaign", script(&include)));
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    let all = versions(&here.join("campaign"));
+    let sets = all[0].figures["sets"].as_array().unwrap();
+    let since: Vec<_> = sets.iter().filter(|set| set["kind"] == "since").collect();
+    // A structure that two walks found has one label, and is in the export of both.
+    let again = ids(&read_extxyz(&here.join("all.extxyz")).unwrap());
+    let [since] = since[..] else { panic!("one set of labels since: {sets:?}") };
+    let structures = since["structures"].as_u64().unwrap() as usize;
+    assert!((1..again.len()).contains(&structures), "{since}");
+}
+
+#[test]
+fn energies_far_from_the_others_are_told_and_recorded() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    prepare(here);
+    let mut frames = read_extxyz(&here.join("replay.extxyz")).unwrap();
+    let mut labels = frames[1].labels().unwrap();
+    labels.energy = labels.energy.map(|energy| energy + 100.0);
+    frames[1].set_labels(&labels, LabelKeys::Ase);
+    write_frames(&here.join("replay.extxyz"), &frames);
+    let native = json!({ "native": { "epochs": 1, "validation_share": 0.0 } });
+    let output = refit(here, &settings(here, "campaign", native));
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(0), "{said}");
+    assert!(
+        said.contains("refit 1: training: the energies of 1 structure are far from the others'"),
+        "{said}"
+    );
+    let all = versions(&here.join("campaign"));
+    let training = &all[0].figures["training"];
+    // Frames of 108 atoms have 110 lines.
+    assert_eq!(training["energy_spread"]["far"][0]["place"], "replay.extxyz:111", "{training}");
+    assert_eq!(training["energy_zero"]["shifts"], json!([]));
+}
+
+/// Test sets may change while a refit is interrupted.
+#[test]
+fn errors_are_those_of_the_test_sets_as_they_are() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    prepare(here);
+    let native = json!({ "native": { "epochs": 1, "validation_share": 0.0 } });
+    let structures = |sets: &Json| sets[0]["structures"].as_u64();
+    kill_at(here, &settings(here, "campaign", native.clone()), &here.join("campaign/refit/1/errors.json"));
+    let kept = fs::read(here.join("campaign/refit/1/errors.json")).unwrap();
+    assert_eq!(structures(&serde_json::from_slice(&kept).unwrap()), Some(3));
+    let frames = read_extxyz(&config("data/al_eam_1l/seed_frames.extxyz")).unwrap();
+    write_frames(&here.join("test.extxyz"), &frames[REPLAY..REPLAY + 2]);
+    let output = refit(here, &settings(here, "campaign", native));
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    let all = versions(&here.join("campaign"));
+    assert_eq!(structures(&all[0].figures["sets"]), Some(2), "{}", all[0].figures);
 }
 
 #[test]

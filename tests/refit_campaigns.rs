@@ -7,13 +7,13 @@ use std::process::Stdio;
 use atoms::extxyz::Frame;
 use atoms::read_extxyz;
 use serde_json::Value as Json;
-use store::Fate;
+use store::{ExportFilter, ExportSource, Fate};
 
 use crate::common::campaign::{Outcome, Small, outcome};
 use crate::common::hosts::{Hosts, uninterrupted_outcome};
-use crate::common::label_campaign::on_store;
+use crate::common::label_campaign::{LabelCampaign, WRITE_FIXED_LABEL, on_store};
 use crate::common::processes::{assert_no_leftovers, pause_walkers, signal, wait_for_process, wait_until};
-use crate::common::{Running, config, deviation, program, succeed, write_frames};
+use crate::common::{Running, calmwalk, config, deviation, program, stderr, succeed, write_frames};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "."];
 
@@ -224,10 +224,254 @@ fn a_campaign_goes_on_with_its_version_when_labels_give_no_other() {
         assert!(reason.contains("): the energy differs from the model's by -2.1277e7 eV/atom"), "{reason}");
         assert!(summary.contains(reason.as_str()), "{summary}");
     }
+    train_without_excluded(here, outcome.versions.len());
     // The walks go on after each of them.
     let [first, .., last] = &outcome.versions[..] else { panic!("three attempts") };
     assert!(last.structures > first.structures && last.last_decision > first.last_decision);
     let taken_up = on_store(here.into(), async |store| store.decisions_of_kind("version").await.unwrap());
     assert_eq!(taken_up, []);
+    assert_eq!(json(here, ["versions", "."])["in_force"], 0);
+}
+
+/// Excludes the bad labels of a campaign whose walks have all ended, after this number of attempts. Each change of the labels makes
+/// another attempt, and nothing else does.
+fn train_without_excluded(here: &Path, attempts: usize) {
+    let bad: Vec<String> = on_store(here.into(), async |store| {
+        let protocol = store.protocols().await.unwrap()[0].hash;
+        let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
+        let rows = store.labelled(&filter, None, u32::MAX).await.unwrap().into_iter();
+        let bad = rows.filter(|row| row.label.energy < -1e6).map(|row| match row.source {
+            ExportSource::Candidate { id, .. } => id,
+            ExportSource::Import { .. } => panic!("an import"),
+        });
+        bad.collect()
+    });
+    assert!(bad.len() > 1, "{bad:?}");
+    let made = || on_store(here.into(), async |store| store.versions().await.unwrap());
+    let nothing_new = || {
+        assert!(succeed(here, ["refit", "."]).starts_with("nothing is new since the last attempt: "));
+        succeed(here, RUN);
+    };
+    nothing_new();
+    assert_eq!(made().len(), attempts);
+    succeed(here, ["exclude", ".", &bad[0], "--reason", "a test"]);
+    let output = calmwalk(here, ["refit", "."]);
+    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+    assert_eq!(made().len(), attempts + 1);
+    for id in &bad[1..] {
+        succeed(here, ["exclude", ".", id, "--reason", "a test"]);
+    }
+    succeed(here, RUN);
+    let versions = made();
+    let [.., before, last] = &versions[..] else { panic!("attempts") };
+    assert_eq!(versions.len(), attempts + 2);
+    assert!(before.reason.contains("the energy differs"), "{}", before.reason);
+    assert!(!last.reason.contains("the energy differs") && last.labels < before.labels, "{last:?}");
+    succeed(here, RUN);
+    assert_eq!(made().len(), attempts + 2);
+}
+
+/// Starts a live campaign whose first label is made at once, and all others when the file `go` is there. `keys` of `[collect]`.
+fn live_with_late_labels(small: &Small, collect: &str) -> LabelCampaign {
+    let script = "mkdir \"$PLACE/first\" 2>/dev/null || while [ ! -e \"$PLACE/go\" ]; do sleep 0.05; done\n";
+    let method =
+        r#"method = { command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } } # "#;
+    let collect = format!("[collect]\n{collect}");
+    let place = LabelCampaign::new(
+        small,
+        &[("[label]\nmethod = ", &format!("[label]\n{method}")), ("[collect]\n", &collect)],
+    );
+    let script = script.replace("$PLACE", place.path().to_str().unwrap());
+    fs::write(place.path().join("label.sh"), format!("{script}{WRITE_FIXED_LABEL}")).unwrap();
+    place
+}
+
+/// Waits until the campaign has a label and this is so.
+fn wait_for_label(place: &LabelCampaign, what: &str, is_so: impl Fn(&Json) -> bool) {
+    wait_until(what, || {
+        let status = place.status();
+        status["labels"]["labelled"].as_u64() >= Some(1) && is_so(&status)
+    });
+}
+
+/// Each attempt fails.
+const REFUSED: &str = r#"
+[refit]
+replay = ["replay.extxyz"]
+held_out = 0.0
+method = { command = { program = ["false"] } }
+"#;
+
+/// An attempt with few labels, as with slow calculations, is followed by one with all of them, though nothing is found meanwhile.
+#[test]
+fn labels_that_come_after_an_attempt_are_trained_on() {
+    let small = Small { mode: "live", max_per_walk: 2, refit: REFUSED, ..Small::default() };
+    let place = live_with_late_labels(&small, "");
+    let mut run = place.run();
+    let has_ended =
+        |walk: &Json| !["running", "waiting"].contains(&walk["state"].as_str().unwrap_or_default());
+    wait_for_label(&place, "all walks have ended", |status| {
+        let walks = status["walks"].as_array().map_or(&[][..], Vec::as_slice);
+        walks.iter().any(|walk| walk["origin"] == "control") && walks.iter().all(has_ended)
+    });
+    let output = calmwalk(place.path(), ["refit", place.argument()]);
+    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+    fs::write(place.path().join("go"), "").unwrap();
+    assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
+    let versions = on_store(place.location(), async |store| store.versions().await.unwrap());
+    let [first, last] = &versions[..] else { panic!("two attempts: {versions:?}") };
+    assert_eq!((first.labels, first.structures), (1, last.structures), "nothing was found meanwhile");
+    assert_eq!(last.labels, place.jobs("labelled"), "{versions:?}");
+}
+
+/// Each version is its parent.
+const COPIES: &str = r#"
+[refit]
+replay = ["replay.extxyz"]
+held_out = 0.0
+max_versions = 2
+method = { command = { program = ["sh", "-c", "cp $CALMWALK_PARENT_MODEL model.npz"] } }
+"#;
+
+/// A version ends the walks that were left, and no walk may start with it: the campaign still waits for its labels.
+#[test]
+fn a_campaign_without_walks_left_waits_for_its_labels() {
+    let small =
+        Small { mode: "live", steps: 100_000, max_per_walk: 1_000, refit: COPIES, ..Small::default() };
+    let place = live_with_late_labels(&small, "max_structures = 3\n");
+    // Control walks take as long as the walks that they match.
+    let path = place.path().join("campaign.toml");
+    let text = fs::read_to_string(&path).unwrap();
+    fs::write(&path, text.replace("equilibration_steps = 20", "equilibration_steps = 3000")).unwrap();
+    let mut run = place.run();
+    wait_for_label(&place, "the biased walks have ended", |status| {
+        let walks = status["walks"].as_array().map_or(&[][..], Vec::as_slice);
+        let mut biased = walks.iter().filter(|walk| walk["origin"] == "biased");
+        status["candidates"]["accepted"] == 3 && biased.all(|walk| walk["state"] == "budget")
+    });
+    let held = pause_walkers(place.path(), 2);
+    let walks = place.status()["walks"].take();
+    assert!(walks.as_array().unwrap().iter().any(|walk| walk["state"] == "running"), "{walks}");
+    succeed(place.path(), ["refit", place.argument()]);
+    // The run looks for new versions each second.
+    std::thread::sleep(std::time::Duration::from_millis(2500));
+    held.resume();
+    wait_until("the version is in force", || place.said().contains("version 1 of the potential is in force"));
+    std::thread::sleep(std::time::Duration::from_millis(500));
+    assert!(run.0.try_wait().unwrap().is_none(), "it waits for labels: {}", place.said());
+    fs::write(place.path().join("go"), "").unwrap();
+    assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
+    assert_eq!((place.jobs("queued"), place.jobs("leased")), (0, 0));
+    let versions = on_store(place.location(), async |store| store.versions().await.unwrap());
+    let [first, last] = &versions[..] else { panic!("two versions: {versions:?}") };
+    assert!(last.labels > first.labels && last.labels >= 3, "{versions:?}");
+}
+
+/// A training that crashes, as it does without memory. `PPID` is the refit.
+const CRASHES: &str = r#"
+[refit]
+replay = ["replay.extxyz"]
+held_out = 0.0
+max_attempts = 1
+method = { command = { program = ["sh", "-c", "kill -ABRT $PPID; sleep 60"] } }
+"#;
+
+#[test]
+fn a_training_that_crashes_is_refused_by_a_live_campaign_alone() {
+    for mode in ["live", "reproducible"] {
+        let directory = tempfile::tempdir().unwrap();
+        let here = directory.path();
+        Small { mode, max_per_walk: 2, refit: CRASHES, ..Small::default() }.write(here);
+        let output = calmwalk(here, RUN);
+        let said = stderr(&output);
+        let versions = on_store(here.into(), async |store| store.versions().await.unwrap());
+        if mode == "live" {
+            assert_eq!(output.status.code(), Some(0), "{said}");
+            let [version] = &versions[..] else { panic!("one attempt: {versions:?}") };
+            assert!(version.state.name() == "refused" && version.reason.contains("SIGABRT"), "{version:?}");
+            assert!(version.figures["label_set"].is_string(), "{version:?}");
+        } else {
+            assert_eq!((output.status.code(), versions.len()), (Some(1), 0), "{said}");
+            assert!(said.contains("the refit failed: ") && said.contains("SIGABRT"), "{said}");
+        }
+        assert_no_leftovers(here);
+    }
+}
+
+const ONE_VERSION: &str = r#"
+[refit]
+replay = ["replay.extxyz"]
+after_structures = 2
+max_versions = 1
+held_out = 0.0
+max_attempts = 1
+method = { native = { epochs = 1, validation_share = 0.0 } }
+"#;
+
+/// A model file that changed, and a disk that cannot be written, refuse nothing.
+#[test]
+fn a_live_campaign_goes_on_beside_a_refit_that_cannot() {
+    let small =
+        Small { mode: "live", steps: 100_000, max_per_walk: 1_000, refit: ONE_VERSION, ..Small::default() };
+    let model = config("data/al_eam_1l/kokkos.npz");
+    let place = LabelCampaign::new(&small, &[(model.to_str().unwrap(), "model.npz")]);
+    let here = place.path();
+    fs::copy(&model, here.join("model.npz")).unwrap();
+    let accepted = || place.status()["candidates"]["accepted"].as_u64().unwrap_or(0);
+    let versions = || on_store(place.location(), async |store| store.versions().await.unwrap());
+
+    let mut run = place.run();
+    wait_until("a structure is accepted", || accepted() > 0);
+    fs::write(here.join("model.npz"), "another model").unwrap();
+    wait_until("a refit could not go on", || {
+        place.said().contains("model.npz: ") && place.said().contains("the walks go on")
+    });
+    let before = accepted();
+    wait_until("the walks go on", || accepted() > before);
+    assert_eq!((versions(), run.0.try_wait().unwrap()), (Vec::new(), None));
+    signal(run.0.id(), "INT");
+    assert_eq!(run.0.wait().unwrap().code(), Some(130), "{}", place.said());
+    fs::copy(&model, here.join("model.npz")).unwrap();
+
+    // No walk is left, and a file is where the refit needs its directory.
+    let path = here.join("campaign.toml");
+    let text = fs::read_to_string(&path).unwrap();
+    fs::write(&path, text.replace("max_per_walk = 1000", "max_per_walk = 1")).unwrap();
+    let _ = fs::remove_dir_all(here.join("refit"));
+    fs::write(here.join("refit"), "").unwrap();
+    assert_eq!(place.run().0.wait().unwrap().code(), Some(1), "{}", place.said());
+    assert!(place.said().contains("the refit failed: ") && versions().is_empty(), "{}", place.said());
+    fs::remove_file(here.join("refit")).unwrap();
+    assert_eq!(place.run().0.wait().unwrap().code(), Some(0), "{}", place.said());
+    let states: Vec<_> = versions().iter().map(|version| version.state.name()).collect();
+    assert_eq!(states, ["registered"], "{:?}", versions());
+}
+
+/// A loss of labels far from the replay data that is no number.
+const NOT_FINITE: &str = r#"
+[refit]
+replay = ["replay.extxyz"]
+after_structures = 3
+max_versions = 1
+held_out = 0.0
+method = { native = { epochs = 1, validation_share = 0.0, energy_weight = 1.7e308, huber_delta = 1000.0 } }
+"#;
+
+#[test]
+fn a_campaign_goes_on_with_its_version_when_the_loss_is_no_number() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let small = Small { max_per_walk: 3, refit: NOT_FINITE, ..Small::default() };
+    let method =
+        r#"method = { command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } } # "#;
+    let text = small.text().replacen("[label]\nmethod = ", &format!("[label]\n{method}"), 1);
+    fs::write(small.write(here), text).unwrap();
+    fs::write(here.join("label.sh"), WRITE_FIXED_LABEL).unwrap();
+    succeed(here, RUN);
+    let outcome = outcome(here);
+    assert!(!outcome.versions.is_empty());
+    for version in &outcome.versions {
+        assert!(version.state.name() == "refused" && version.reason.contains("not finite"), "{version:?}");
+    }
     assert_eq!(json(here, ["versions", "."])["in_force"], 0);
 }

@@ -305,6 +305,11 @@ fn wrong_arguments_are_refused_before_any_work() {
     );
     symlink("data.extxyz", here.join("link.extxyz")).unwrap();
     wrong(&["--validation", "link.extxyz"], "link.extxyz, a file of validation data, is the same file");
+    fs::copy(here.join("data.extxyz"), here.join("copy.extxyz")).unwrap();
+    wrong(
+        &["--validation", "copy.extxyz"],
+        "copy.extxyz, a file of validation data, has the same content as data.extxyz, a file of training data",
+    );
     let linked = here.join("link.npz");
     symlink(config(MODEL), &linked).unwrap();
     let message = refuse(here, arguments("link.npz", &whole));

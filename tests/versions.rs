@@ -325,7 +325,10 @@ fn a_version_is_trained_beside_a_live_campaign_once_for_what_is_new() {
     // Another attempt after what the walks have found meanwhile, and none without anything new.
     calmwalk(here, ["refit", "here"]);
     let said = succeed(here, ["refit", "here"]);
-    assert_eq!(said, "no structure was accepted since the last attempt: nothing to do\n");
+    assert_eq!(
+        said,
+        "nothing is new since the last attempt: no structure was accepted, and the labels are the same\n"
+    );
     let list = json_of(here, []);
     assert_eq!((&list["versions"][1]["state"], &list["in_force"]), (&json!("refused"), &json!(0)));
     fs::rename(here.join("campaign.toml"), here.join("moved.toml")).unwrap();

@@ -143,7 +143,7 @@ mod tests {
             rules: RefitRules { min_improvement: least, max_versions: most, ..RefitRules::default() },
             versions: versions.to_vec(),
             accepted: 200,
-            labels_came_late: false,
+            ..RefitProgress::default()
         };
         let found = |least, most, versions: &[VersionRecord]| {
             CampaignEnd::find(&status, &json!({}), &progress(least, most, versions))

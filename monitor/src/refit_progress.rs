@@ -1,16 +1,18 @@
 //! Whether a version of the potential is left to train, and which labels versions are trained on.
 
 use serde_json::Value;
-use store::{ExportFilter, ExportRow, ExportSource, Store, StoreError, VersionRecord, VersionState};
-use wire::Origin;
+use store::{
+    ExportCursor, ExportRow, ExportSource, LabelMark, Store, StoreError, VersionRecord, VersionState,
+};
+use wire::{ContentHash, Origin};
 
 use crate::improvement::{Improvement, trained_versions};
 
 /// Why a version without any label to train on is refused.
 pub const NO_LABELS: &str = "there are no labels to train on";
 
-/// Rows read at a time.
-const PAGE_ROWS: u32 = 200;
+/// Key of a version's figures with the [`LabelSet`] that it was trained on.
+pub const LABEL_SET: &str = "label_set";
 
 /// What the labels of a campaign are for in a refit.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -22,6 +24,11 @@ pub struct LabelSplit {
     /// Random seed of the campaign.
     pub rng_seed: u64,
 }
+
+/// A hash of the labels that a refit trains on: which structures, with which energies, by which protocol. The order in which labels
+/// arrived does not count.
+#[derive(Clone)]
+pub struct LabelSet(blake3::Hasher);
 
 /// What a label is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -56,19 +63,53 @@ pub struct RefitProgress {
     pub accepted: u64,
     /// The last attempts were refused because there was no label to train on, and there is one now: they do not count.
     pub labels_came_late: bool,
+    /// The labels to train on are others than those of the last attempt: some came, were excluded or were made again.
+    pub has_new_labels: bool,
+}
+
+impl LabelSet {
+    /// Without labels yet.
+    pub fn new(protocol: ContentHash) -> Self {
+        let mut hasher = blake3::Hasher::new();
+        hasher.update(&protocol.0);
+        Self(hasher)
+    }
+
+    /// Adds the label of a structure with this energy, in the order of [`Store::labelled`].
+    pub fn add(&mut self, cursor: ExportCursor, energy: f64) {
+        let (kind, number) = match cursor {
+            ExportCursor::Candidate(decision) => (0, decision),
+            ExportCursor::Import(number) => (1, number),
+        };
+        self.0.update(&[kind]);
+        self.0.update(&number.to_le_bytes());
+        self.0.update(&energy.to_le_bytes());
+    }
+
+    /// The hash, as the figures of a version have it.
+    pub fn hash(&self) -> String {
+        self.0.finalize().to_string()
+    }
 }
 
 impl LabelSplit {
     /// What a label is for.
     pub fn purpose(&self, row: &ExportRow) -> LabelPurpose {
         match &row.source {
-            ExportSource::Candidate { seed_structure_name, .. } if self.is_held_out(seed_structure_name) => {
-                LabelPurpose::HeldOut
+            ExportSource::Candidate { seed_structure_name, origin, .. } => {
+                self.purpose_of(seed_structure_name, *origin)
             }
-            ExportSource::Candidate { origin: Origin::Control, .. } if self.compares_controls => {
-                LabelPurpose::Control
-            }
-            _ => LabelPurpose::Training,
+            ExportSource::Import { .. } => LabelPurpose::Training,
+        }
+    }
+
+    fn purpose_of(&self, seed_structure: &str, origin: Origin) -> LabelPurpose {
+        if self.is_held_out(seed_structure) {
+            LabelPurpose::HeldOut
+        } else if self.compares_controls && origin == Origin::Control {
+            LabelPurpose::Control
+        } else {
+            LabelPurpose::Training
         }
     }
 
@@ -83,19 +124,20 @@ impl LabelSplit {
         (number as f64) / ((1_u64 << 53) as f64) < self.held_out
     }
 
-    /// Whether the campaign has any label that a refit trains on now. Reads labels until it finds one.
-    async fn has_label_to_train_on(&self, store: &Store) -> Result<bool, StoreError> {
-        let Some(protocol) = store.protocol_in_force().await? else { return Ok(false) };
-        let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: true };
-        let mut last = None;
-        loop {
-            let page = store.labelled(&filter, last, PAGE_ROWS).await?;
-            let Some(end) = page.last() else { return Ok(false) };
-            last = Some(end.cursor);
-            if page.iter().any(|row| self.purpose(row) == LabelPurpose::Training) {
-                return Ok(true);
-            }
+    /// The hash of the labels that a refit trains on now, and their number; `None` without a protocol.
+    pub async fn label_set(&self, store: &Store) -> Result<Option<(String, usize)>, StoreError> {
+        let Some(protocol) = store.protocol_in_force().await? else { return Ok(None) };
+        let is_for_training = |mark: &LabelMark| {
+            let purpose =
+                mark.walk.as_ref().map(|(seed_structure, origin)| self.purpose_of(seed_structure, *origin));
+            purpose.is_none_or(|purpose| purpose == LabelPurpose::Training)
+        };
+        let (mut set, mut labels) = (LabelSet::new(protocol.hash), 0);
+        for mark in store.label_marks(protocol.hash).await?.iter().filter(|mark| is_for_training(mark)) {
+            set.add(mark.cursor, mark.energy);
+            labels += 1;
         }
+        Ok(Some((set.hash(), labels)))
     }
 }
 
@@ -120,10 +162,19 @@ impl RefitProgress {
     /// Reads it from the campaign's database.
     pub async fn read(store: &Store, rules: RefitRules) -> Result<Self, StoreError> {
         let versions = store.versions().await?;
-        let labels_came_late = rules.max_versions > 0
-            && versions.last().is_some_and(had_no_labels)
-            && rules.split.has_label_to_train_on(store).await?;
-        Ok(Self { rules, versions, accepted: store.accepted_structures().await?, labels_came_late })
+        let accepted = store.accepted_structures().await?;
+        let mut progress = Self { rules, versions, accepted, ..Self::default() };
+        let had_none = progress.versions.last().is_some_and(had_no_labels);
+        // Where structures are new, it does not matter whether labels are.
+        let may_matter = !progress.versions.is_empty() && (had_none || !progress.has_new_structures());
+        if rules.max_versions > 0
+            && may_matter
+            && let Some((hash, labels)) = rules.split.label_set(store).await?
+        {
+            progress.labels_came_late = had_none && labels > 0;
+            progress.has_new_labels = progress.labels_before().is_some_and(|before| before != hash);
+        }
+        Ok(progress)
     }
 
     /// Whether a version is left to train when all walks have ended: there may be more versions, and there is anything new.
@@ -147,9 +198,19 @@ impl RefitProgress {
         trained_versions(&self.versions).count() >= self.rules.max_versions
     }
 
-    /// Whether structures were accepted since the last attempt.
+    /// Whether the next refit has anything that the last attempt had not: accepted structures, or other labels.
     pub fn has_news(&self) -> bool {
+        self.has_new_structures() || self.has_new_labels
+    }
+
+    fn has_new_structures(&self) -> bool {
         self.accepted > self.accepted_before()
+    }
+
+    /// The [`LabelSet`] of the last attempt; `None` if there was none, or an earlier program made it.
+    fn labels_before(&self) -> Option<&str> {
+        let trained = self.versions.iter().rev().find(|version| version.method != VersionRecord::ROLLBACK)?;
+        trained.figures[LABEL_SET].as_str()
     }
 
     /// Number of accepted structures at the last attempt.
@@ -202,6 +263,43 @@ mod tests {
         assert_eq!(RefitRules::from_json(&configuration), expected);
     }
 
+    /// A label that came, was excluded or was made again since the last attempt makes a refit left.
+    #[test]
+    fn other_labels_are_news() {
+        let hash = |labels: &[(ExportCursor, f64)], protocol| {
+            let mut set = LabelSet::new(ContentHash([protocol; 32]));
+            labels.iter().for_each(|(cursor, energy)| set.add(*cursor, *energy));
+            set.hash()
+        };
+        let (first, second) = ((ExportCursor::Candidate(1), -3.0), (ExportCursor::Candidate(2), -2.0));
+        let before = hash(&[first, second], 0);
+        assert_eq!(before, hash(&[first, second], 0));
+        let others = [
+            hash(&[first], 0),
+            hash(&[first, (ExportCursor::Candidate(2), -2.5)], 0),
+            hash(&[first, (ExportCursor::Import(2), -2.0)], 0),
+            hash(&[first, second], 1),
+        ];
+        assert!(others.iter().all(|other| *other != before));
+
+        let attempt =
+            VersionRecord { figures: json!({ LABEL_SET: before }), ..version(1, 4, "held_out", [1.0, 0.9]) };
+        let mut progress = RefitProgress {
+            rules: RefitRules { max_versions: 2, ..RefitRules::default() },
+            versions: vec![attempt.clone()],
+            accepted: 4,
+            ..RefitProgress::default()
+        };
+        assert_eq!((progress.labels_before(), progress.is_refit_left()), (Some(before.as_str()), false));
+        progress.has_new_labels = true;
+        assert!(progress.is_refit_left());
+        // A version that is an earlier one again was trained on nothing.
+        let rollback =
+            VersionRecord { method: VersionRecord::ROLLBACK.into(), figures: Value::Null, ..attempt };
+        progress.versions.push(rollback);
+        assert_eq!(progress.labels_before(), Some(before.as_str()));
+    }
+
     /// A structure whose label came too late for an attempt is trained on by the next one.
     #[test]
     fn attempts_without_labels_do_not_count_once_there_are_labels() {
@@ -214,7 +312,7 @@ mod tests {
             rules: RefitRules { max_versions: 2, ..RefitRules::default() },
             versions: vec![refused(1, "its errors rose"), refused(2, NO_LABELS), refused(3, NO_LABELS)],
             accepted: 7,
-            labels_came_late: false,
+            ..RefitProgress::default()
         };
         assert_eq!((progress.accepted_before(), progress.is_refit_left()), (7, false));
         progress.labels_came_late = true;

@@ -1,13 +1,14 @@
 //! Walks end when they find nothing new for a number of steps together.
 
-use orchestrator::selector::{CampaignMode, SelectorSettings, SelectorSnapshot};
+use orchestrator::selector::{CampaignMode, SeedStructurePlan, SelectorSettings, SelectorSnapshot};
 use store::records::Commit;
+use wire::WalkConditions;
 use wire::messages::{Outcome, WalkProgress};
 
 use crate::common::memory::MemoryStore;
 use crate::common::{
-    SHORTEST, at, begin, decided, kinds, next_assignment, offer, report, restore, settings, structure, value,
-    with_version,
+    SHORTEST, at, begin, decided, kinds, next_assignment, offer, report, restore, restore_with,
+    seed_structure, settings, structure, value, with_version,
 };
 
 const NEW: [f64; 3] = [0.0, 3.0, 0.0];
@@ -104,4 +105,28 @@ fn structures_of_live_walks_that_are_under_way_are_accepted_but_the_limit_stays_
     store.commit(&commit);
     let mut selector = restore(&live, 3, store.snapshot());
     assert!(selector.start_walks().decisions.is_empty() && selector.is_done());
+}
+
+/// Walks of other groups neither count nor start the count anew.
+#[test]
+fn steps_and_structures_of_some_groups_can_count_alone() {
+    let settings = SelectorSettings { stop_groups: vec!["target".into()], ..limited(CampaignMode::Live, 20) };
+    let seeds = ["target", "other"].into_iter().enumerate().map(|(number, group)| SeedStructurePlan {
+        walks: vec![WalkConditions { group: group.into(), ..WalkConditions::default() }],
+        ..seed_structure(number)
+    });
+    let mut selector = restore_with(&settings, seeds.collect(), SelectorSnapshot::default());
+    selector.start_walks();
+    let [target, other] = [(); 2].map(|()| next_assignment(&mut selector));
+    let commit = decided(&mut selector, report(&other, Outcome::StepsDone, at(10)));
+    assert_eq!(value(&commit, COUNT), "0");
+    let commit = decided(&mut selector, report(&target, Outcome::StepsDone, at(10)));
+    assert_eq!(value(&commit, COUNT), "10");
+    let [target, other] = [(); 2].map(|()| next_assignment(&mut selector));
+    let found = offer(&selector, &other, 15, structure(1, SHORTEST), NEW);
+    let commit = decided(&mut selector, found);
+    assert_eq!((kinds(&commit), value(&commit, COUNT)), (vec!["accepted".to_owned()], "10"));
+    // All biased walks end with them.
+    let commit = decided(&mut selector, report(&target, Outcome::StepsDone, at(20)));
+    assert_eq!((kinds(&commit), value(&commit, COUNT)), (vec!["ended".to_owned(); 2], "20"));
 }

@@ -2,13 +2,16 @@
 
 use std::path::PathBuf;
 
+use monitor::refit_progress::LabelSplit;
 use potentials::ModelWithFeatures;
 use tokio_util::sync::CancellationToken;
 use toml::Spanned;
 
 use super::loader::Loader;
-use crate::config::ConfigError;
+use super::seed_structures::SourcedStructure;
+use crate::config::{ConfigError, Warning, location};
 use crate::labelled_frames::read_without_warning;
+use crate::output::count;
 use crate::structure_files::StructureReadingArgs;
 
 impl Loader<'_> {
@@ -34,6 +37,30 @@ impl Loader<'_> {
             }
         }
         Ok(hashes)
+    }
+
+    /// Warns if `refit.held_out` holds out none of the seed structures, or all: which ones is a matter of chance.
+    pub fn suspicious_held_out(&self, seeds: &[SourcedStructure]) -> Option<Warning> {
+        let refit = self.config.refit.as_ref().filter(|refit| refit.held_out > 0.0)?;
+        let rng_seed = self.config.campaign.rng_seed;
+        let split = LabelSplit { held_out: refit.held_out, compares_controls: false, rng_seed };
+        let held_out = seeds.iter().filter(|seed| split.is_held_out(&seed.plan.name)).count();
+        let all = count(seeds.len() as u64, "seed structure");
+        let message = if held_out == 0 {
+            format!(
+                "none of {all} is held out, so max_held_out_error_ratio refuses nothing; take a larger share, or another \
+                 campaign.rng_seed, or 0 if that is meant"
+            )
+        } else if held_out == seeds.len() {
+            format!(
+                "all of {all} are held out, so no version is trained on labels of walks; take a smaller share, or another \
+                 campaign.rng_seed"
+            )
+        } else {
+            return None;
+        };
+        const KEY: &str = "refit.held_out";
+        Some(Warning { at: location(self.path, self.text, KEY), key: KEY.to_owned(), message })
     }
 
     /// Reads the labelled structures of a file.
@@ -136,6 +163,28 @@ mod tests {
         let without = load(here, "").unwrap();
         assert_eq!(without.resolved().get("refit"), None);
         assert_ne!(without.id(), first.id());
+    }
+
+    #[test]
+    fn chance_that_holds_out_none_or_all_seed_structures_is_told() {
+        let directory = tempfile::tempdir().unwrap();
+        let here = directory.path();
+        write(here, "a", "energy=1", "Al 0 0 0 0 0 0");
+        let warnings = |held_out: &str| -> Vec<String> {
+            let campaign =
+                load(here, &format!("[refit]\nreplay = [\"a.xyz\"]\nheld_out = {held_out}\n")).unwrap();
+            let of_key = campaign.warnings.iter().filter(|warning| warning.key == "refit.held_out");
+            of_key.map(ToString::to_string).collect()
+        };
+        for (held_out, expected) in [("1e-9", "none of "), ("0.999999", "all of ")] {
+            let found = warnings(held_out);
+            assert!(
+                found.len() == 1 && found[0].contains(expected) && found[0].contains("c.toml:"),
+                "{found:?}"
+            );
+        }
+        assert_eq!(warnings("0.0"), [""; 0]);
+        assert_eq!(warnings("0.5"), [""; 0]);
     }
 
     #[test]

@@ -57,7 +57,12 @@ impl RefitArgs {
         warn_if_unencrypted(&location);
         let stop = stop_token()?;
         let Some(outcome) = block_on(self.refit(&location, &stop))?? else {
-            print(|out| writeln!(out, "no structure was accepted since the last attempt: nothing to do"))?;
+            print(|out| {
+                writeln!(
+                    out,
+                    "nothing is new since the last attempt: no structure was accepted, and the labels are the same"
+                )
+            })?;
             return Ok(ExitStatus::Done);
         };
         match outcome {

@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may change when a campaign is resumed; all others keep their first values.
-pub(super) const CHANGEABLE: [&str; 92] = [
+pub(super) const CHANGEABLE: [&str; 93] = [
     "campaign.control_share",
     "potential.python.environment",
     "potential.python.launcher",
@@ -62,6 +62,7 @@ pub(super) const CHANGEABLE: [&str; 92] = [
     "budget.core_hours",
     "budget.wall_time",
     "stop.max_steps_without_structure",
+    "stop.walks",
     "stop.min_improvement",
     "run.walkers",
     "run.threads_per_walker",

@@ -17,7 +17,7 @@ use self::constant_pressure::check_constant_pressure;
 use self::refit::check_refit;
 use super::error::InvalidValue;
 use super::ranges;
-use super::{Config, LabelSection, LaunchSection, NotifySection, QueueFull};
+use super::{Config, LabelSection, LaunchSection, NotifySection, QueueFull, StopSection};
 
 /// Upper limit of the smallest allowed distance of a pair of elements, Å.
 const MAX_MIN_DISTANCE: f64 = 10.0;
@@ -42,6 +42,7 @@ pub fn check(config: &Config) -> Vec<InvalidValue> {
         check_completion(config),
         check_budget(config),
         check_stop(config),
+        check_stop_walks(config),
         check_notify(&config.notify),
         check_seed_structures(config),
     ];
@@ -104,6 +105,24 @@ fn check_stop(config: &Config) -> Result<(), InvalidValue> {
         Some(_) => return Ok(()),
     };
     wrong("stop.min_improvement", least.get(), expected)
+}
+
+fn check_stop_walks(config: &Config) -> Result<(), InvalidValue> {
+    let StopSection { walks, max_steps_without_structure, .. } = &config.stop;
+    let walks = walks.as_deref().unwrap_or_default();
+    let names: Vec<_> = config.walks.iter().map(|group| group.name.as_str()).collect();
+    if let Some(unknown) = walks.iter().find(|name| !names.contains(&name.as_str())) {
+        let expected = match names.is_empty() {
+            true => "no such key: there are no groups of [[walks]]".to_owned(),
+            false => format!("a group of [[walks]]: {}", names.join(", ")),
+        };
+        return wrong("stop.walks", format!("\"{unknown}\""), expected);
+    }
+    if !walks.is_empty() && max_steps_without_structure.is_none() {
+        let expected = "stop.max_steps_without_structure, which it belongs to";
+        return wrong("stop.walks", walks.join(", "), expected);
+    }
+    Ok(())
 }
 
 /// The length of the queue depends on the speed of the labellers, which is not reproducible.

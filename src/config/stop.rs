@@ -13,6 +13,9 @@ pub struct StopSection {
     /// Largest number of steps that the biased walks make together after the last accepted structure. Then all of them end.
     /// Default: no limit.
     pub max_steps_without_structure: Option<NonZeroU64>,
+    /// Groups of `[[walks]]` whose steps and structures count for `max_steps_without_structure`, such as those at the conditions that
+    /// the potential is for. Default: all.
+    pub walks: Option<Vec<String>>,
     /// Smallest relative fall of the force errors on held-out labels, for each 100 labels more than the parent was trained on. A
     /// version with less is the last, and no walk starts with it. Default: none.
     pub min_improvement: Option<Positive>,
@@ -47,10 +50,19 @@ mod tests {
         let refit = |lines: &str| format!("[refit]\nreplay = [\"r.extxyz\"]\n{lines}\n");
         let test_set = "test_sets = [{ name = \"liquid\", file = \"l.extxyz\" }]";
         let (least, steps) = ("min_improvement = 0.02", "max_steps_without_structure");
+        let group = "[[walks]]\nname = \"hot\"\n";
         for (commented, line, behind, expected) in [
             (STEPS, format!("{steps} = 5000"), String::new(), ""),
             (STEPS, format!("{steps} = 0"), String::new(), "expected a whole number"),
             (STEPS, format!("{steps} = 2000000000000"), String::new(), "expected at most 1e12"),
+            (STEPS, format!("{steps} = 5000\nwalks = [\"hot\"]"), group.into(), ""),
+            (
+                STEPS,
+                format!("{steps} = 5000\nwalks = [\"hto\"]"),
+                group.into(),
+                "expected a group of [[walks]]: hot",
+            ),
+            (STEPS, "walks = [\"hot\"]".into(), group.into(), "expected stop.max_steps_without_structure"),
             (IMPROVEMENT, least.into(), refit(""), ""),
             (IMPROVEMENT, least.into(), refit(&format!("held_out = 0\n{test_set}")), ""),
             (IMPROVEMENT, least.into(), String::new(), "stop.min_improvement is 0.02; expected [refit]"),
@@ -66,7 +78,9 @@ mod tests {
             let text = with(commented, &line, &behind);
             let found = errors(&text);
             assert_eq!(found.is_empty(), expected.is_empty(), "{line}: {found}");
-            let number = 1 + text.lines().position(|one| one.starts_with(&line)).unwrap();
+            // The last line of several is the one that is wrong.
+            let wrong = line.lines().last().unwrap();
+            let number = 1 + text.lines().position(|one| one.starts_with(wrong)).unwrap();
             let at = if expected.is_empty() { String::new() } else { format!("c.toml:{number}:") };
             assert!(found.starts_with(&at) && found.contains(expected), "{found}\nexpected {at} {expected}");
         }

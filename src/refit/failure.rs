@@ -1,5 +1,6 @@
 //! Why a refit ends without a new version.
 
+use potentials::grace::GraceError;
 use store::StoreError;
 use upfit::UpfitError;
 
@@ -24,7 +25,15 @@ impl RefitFailure {
     pub fn of_input(error: CommandError) -> Self {
         match error {
             CommandError::Input(reason) => Self::Refused(reason),
-            failed @ CommandError::Failed(_) => Self::Failed(failed),
+            failed @ (CommandError::Unreadable(_) | CommandError::Failed(_)) => Self::Failed(failed),
+        }
+    }
+
+    /// An error of a model file. One that the system cannot read says nothing about the model.
+    pub fn of_model(error: GraceError) -> Self {
+        match error {
+            GraceError::Read { .. } => Self::Failed(CommandError::failed(error)),
+            wrong => Self::refused(wrong),
         }
     }
 
@@ -53,6 +62,8 @@ impl From<StoreError> for RefitFailure {
 
 #[cfg(test)]
 mod tests {
+    use atoms::FileError;
+
     use super::*;
 
     #[test]
@@ -78,5 +89,14 @@ mod tests {
         assert!(is_refused(&RefitFailure::of_input(CommandError::input("a label"))));
         assert!(!is_refused(&RefitFailure::of_input(CommandError::failed("a disk"))));
         assert!(!is_refused(&CommandError::input("a file of the configuration").into()));
+        // As of a file system that is gone for a moment, or a process with too many open files.
+        let system = || std::io::Error::from_raw_os_error(24);
+        let open = FileError::Open { path: "train.extxyz".into(), source: system() };
+        assert!(!is_refused(&RefitFailure::of_input(open.into())));
+        assert!(is_refused(&RefitFailure::of_input(FileError::Empty("train.extxyz".into()).into())));
+        let read = GraceError::Read { path: "model.npz".into(), source: system() };
+        assert!(!is_refused(&RefitFailure::of_model(read)));
+        let damaged = GraceError::Damaged { path: "model.npz".into(), key: None, reason: "text".into() };
+        assert!(is_refused(&RefitFailure::of_model(damaged)));
     }
 }

@@ -176,7 +176,7 @@ impl DataSets {
         model: &Path,
         evaluation: &EvaluationContext<'_>,
     ) -> Result<Option<Vec<ComparedSet>>, RefitFailure> {
-        let model = load(model, precision).map_err(RefitFailure::refused)?;
+        let model = load(model, precision).map_err(RefitFailure::of_model)?;
         let found = self.errors_of(&model, evaluation).map_err(RefitFailure::of_training)?;
         let named = |(set, errors): (&DataSet, SetErrors)| ComparedSet { name: set.name.clone(), errors };
         Ok(found.map(|errors| self.sets.iter().zip(errors).map(named).collect()))
@@ -213,8 +213,12 @@ fn load(path: &Path, precision: Precision) -> Result<GraceModel, GraceError> {
 /// # Errors
 /// Refused: a file that is no model, a model with others. Failed: the parent's file.
 pub fn load_version(config: &RefitterConfig, path: &Path) -> Result<GraceModel, RefitFailure> {
-    let unreadable =
-        |error: GraceError| RefitFailure::Refused(format!("the new model cannot be read: {error}"));
+    let unreadable = |error: GraceError| match RefitFailure::of_model(error) {
+        RefitFailure::Refused(reason) => {
+            RefitFailure::Refused(format!("the new model cannot be read: {reason}"))
+        }
+        failed @ RefitFailure::Failed(_) => failed,
+    };
     let version = load(path, config.precision).map_err(unreadable)?;
     let parent = load(&config.parent_model.path, config.precision).map_err(CommandError::input)?;
     let wrong = |what: &str| {

@@ -89,7 +89,7 @@ fn model(
     config: &RefitterConfig,
     path: &Path,
 ) -> Result<(FeatureModel, Projection, Option<i64>), RefitFailure> {
-    let mut model = GraceModel::load(path).map_err(RefitFailure::refused)?;
+    let mut model = GraceModel::load(path).map_err(RefitFailure::of_model)?;
     let is_its_own = model.projection().is_some();
     if !is_its_own {
         let projection = Projection::load(&config.parent_mixture.path).map_err(CommandError::input)?;

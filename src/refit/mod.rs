@@ -17,23 +17,25 @@ mod training_set;
 
 use std::collections::HashSet;
 use std::fs::{self, File, TryLockError};
+use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use atoms::extxyz::write_frame;
-use monitor::refit_progress::NO_LABELS;
+use monitor::refit_progress::{LABEL_SET, NO_LABELS};
 use potentials::grace::{GraceModel, Threads};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use store::{Store, VersionFiles, VersionRecord, VersionState, unix_milliseconds};
 use tokio_util::sync::CancellationToken;
+use upfit::{EnergyDeviations, EnergyZero};
 
 pub use self::command::end_marked_when_alone;
 use self::cost::{CostMeter, RefitCost};
 use self::failure::RefitFailure;
 use self::judge::{ComparisonFigures, DataSets, EvaluationContext, SetFigures, load_version, refusal};
-use self::native::NativeTraining;
-use self::settings::{RefitterConfig, TestSet};
-use self::training_set::{FrozenSet, LabelFile, LabelFiles, kept};
+use self::native::{NativeTraining, TrainingReport};
+use self::settings::{RefitSettings, RefitterConfig, TestSet};
+use self::training_set::{FrozenSet, LabelChoice, LabelFile, LabelFiles, kept};
 use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::config::{ControlFrames, NativeRefit, RefitMethod};
 use crate::exit_status::CommandError;
@@ -48,6 +50,12 @@ const LOCK: &str = "refit.lock";
 /// The new model and its mixture.
 const MODEL: &str = command::MODEL;
 const MIXTURE: &str = "mixture.npz";
+/// The errors of the version and of those before it.
+const ERRORS: &str = "errors.json";
+/// Begin of the names of files of models that are trained for comparison.
+const COMPARISON: &str = "comparison-";
+/// The file with a hash of test sets and structures for comparison, which the errors belong to.
+const JUDGED_WITH: &str = "judged_with";
 /// Name of the comparison with control frames.
 const CONTROL: &str = "control";
 
@@ -63,12 +71,17 @@ pub enum RefitOutcome {
 }
 
 /// A training, as it is recorded with the version.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 struct TrainingRecord {
     /// Structures trained on, those of the replay data among them; `None` if a program trained.
     structures: Option<u64>,
     validation: Option<u64>,
     epochs: Option<u64>,
+    /// How calmwalk moved the zero of the energies, and how energies differ from the model's after that.
+    #[serde(default)]
+    energy_zero: Option<EnergyZero>,
+    #[serde(default)]
+    energy_spread: Option<EnergyDeviations>,
 }
 
 /// A refit under way.
@@ -102,6 +115,7 @@ async fn run(
     let number = 1 + versions.last().map_or(0, |version| version.number);
     let protocol = store.protocol_in_force().await?.map_or_else(String::new, |found| found.hash.to_string());
     let directory = prepare_directory(&config.directory, number, &protocol)?;
+    remove_stale_errors(&directory, &config.settings)?;
     let meter = CostMeter::new(&directory);
     let set = kept::<_, CommandError>(directory.join("set.json"), async || {
         // In this order: a structure that is accepted in between counts for the next refit.
@@ -111,8 +125,7 @@ async fn run(
     });
     let Some(set) = set.await? else { return Ok(RefitOutcome::Stopped) };
     let labels = kept(directory.join("labels.json"), async || {
-        let settings = (&config.settings, config.rng_seed);
-        training_set::write(store, (&directory, &set), settings, false, stop).await
+        training_set::write(store, (&directory, &set), config.label_split(), LabelChoice::OfSet, stop).await
     });
     let Some(labels) = labels.await? else { return Ok(RefitOutcome::Stopped) };
     let report_numbered = |line: String| {
@@ -152,7 +165,7 @@ fn lock(campaign: &Path) -> Result<File, CommandError> {
 /// How this refit ended, if an earlier process of it recorded that and was killed then.
 ///
 /// A registered version that is newer than the parent was made since this refit was configured. The parent of a refused one remains;
-/// its directory is left, and nothing was accepted since.
+/// its directory is left, nothing was accepted since, and the labels are the same.
 async fn recorded_before(
     config: &RefitterConfig,
     store: &Store,
@@ -162,7 +175,7 @@ async fn recorded_before(
     let directory = config.directory.join(FOLDER).join(last.number.to_string());
     let ended = if last.state == VersionState::Registered {
         (last.number > config.parent_version).then(|| RefitOutcome::Registered(last.clone()))
-    } else if directory.exists() && store.accepted_structures().await? == last.structures {
+    } else if directory.exists() && !has_news_since(config, store, last).await? {
         Some(RefitOutcome::Refused(last.clone()))
     } else {
         None
@@ -171,6 +184,17 @@ async fn recorded_before(
         let _ = fs::remove_dir_all(&directory);
     }
     Ok(ended)
+}
+
+/// Whether structures were accepted, or labels changed, since an attempt.
+async fn has_news_since(
+    config: &RefitterConfig,
+    store: &Store,
+    attempt: &VersionRecord,
+) -> Result<bool, CommandError> {
+    let (set, _) = config.label_split().label_set(store).await?.unwrap_or_default();
+    let before = attempt.figures[LABEL_SET].as_str();
+    Ok(store.accepted_structures().await? != attempt.structures || before.is_some_and(|before| before != set))
 }
 
 /// Fails if a file has another content than when the campaign began, or this refit.
@@ -200,6 +224,33 @@ fn prepare_directory(campaign: &Path, number: u32, protocol: &str) -> Result<Pat
         }
     }
     Ok(directory)
+}
+
+/// Removes what an interrupted refit has found with other test sets or structures for comparison, which may change.
+fn remove_stale_errors(directory: &Path, settings: &RefitSettings) -> Result<(), CommandError> {
+    let now =
+        serde_json::to_string(&(&settings.test_sets, &settings.comparisons)).map_err(CommandError::failed)?;
+    let now = blake3::hash(now.as_bytes()).to_string();
+    let record = directory.join(JUDGED_WITH);
+    match fs::read_to_string(&record) {
+        Ok(before) if before == now => return Ok(()),
+        Err(error) if error.kind() != ErrorKind::NotFound => return Err(cannot_read(&record, error)),
+        _ => {}
+    }
+    for entry in fs::read_dir(directory).map_err(CommandError::failed)? {
+        let path = entry.map_err(CommandError::failed)?.path();
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        if name == ERRORS || name.starts_with(COMPARISON) {
+            fs::remove_file(&path).map_err(|error| cannot_write(&path, error))?;
+        }
+    }
+    let mut file = AtomicFile::create(&record)?;
+    file.write_all(now.as_bytes()).map_err(|error| cannot_write(&record, error))?;
+    file.finish()
+}
+
+fn cannot_read(path: &Path, error: std::io::Error) -> CommandError {
+    CommandError::Failed(format!("cannot read {}: {error}", path.display()))
 }
 
 impl Refit<'_> {
@@ -242,8 +293,8 @@ impl Refit<'_> {
     /// The data sets to judge with. `None` if it was stopped.
     async fn data_sets(&self) -> Result<Option<DataSets>, RefitFailure> {
         let since = kept(self.directory.join("since.json"), async || {
-            let settings = (&self.config.settings, self.config.rng_seed);
-            training_set::write(self.store, (&self.directory, &self.set), settings, true, self.stop).await
+            let (set, split) = ((&*self.directory, &self.set), self.config.label_split());
+            training_set::write(self.store, set, split, LabelChoice::Since(&self.labels), self.stop).await
         });
         let Some(since) = since.await? else { return Ok(None) };
         DataSets::read(&self.config.settings, &self.directory, [&self.labels, &since], self.stop)
@@ -255,7 +306,7 @@ impl Refit<'_> {
         sets: &DataSets,
         version: &GraceModel,
     ) -> Result<Option<Vec<SetFigures>>, RefitFailure> {
-        kept(self.directory.join("errors.json"), async || {
+        kept(self.path(ERRORS), async || {
             (self.report)("judging".to_owned());
             let evaluation = self.evaluation()?;
             tokio::task::block_in_place(|| sets.errors(self.config, version, &evaluation))
@@ -299,7 +350,7 @@ impl Refit<'_> {
                 let held_out = self.labels.path(&self.directory, LabelFile::HeldOut);
                 let files = (labels, held_out.as_deref());
                 let ended = command::run(command, self.config, &self.directory, files, self.stop).await?;
-                Ok(ended.map(|()| TrainingRecord { structures: None, validation: None, epochs: None }))
+                Ok(ended.map(|()| TrainingRecord::default()))
             }
         }
     }
@@ -314,13 +365,18 @@ impl Refit<'_> {
         let begin = (self.config.begin(), format!("version {}", self.config.begin_version()));
         let training = NativeTraining { begin, labels, output };
         let settings = (&self.config.settings, native);
-        let report = |line: String| (self.report)(format!("{what}: {line}"));
-        let trained =
-            tokio::task::block_in_place(|| training.run(settings, self.config.rng_seed, self.stop, &report))?;
+        let progress = |line: String| (self.report)(format!("{what}: {line}"));
+        let number = self.set.number;
+        let warning = |text: String| log_and_warn(format_args!("refit {number}: {what}: {text}"));
+        let report = TrainingReport { progress: &progress, warning: &warning };
+        let seed = self.config.rng_seed;
+        let trained = tokio::task::block_in_place(|| training.run(settings, seed, self.stop, report))?;
         Ok(trained.map(|summary| TrainingRecord {
             structures: Some(summary.structures),
             validation: Some(summary.validation),
             epochs: Some(summary.epochs),
+            energy_zero: Some(summary.zero),
+            energy_spread: Some(summary.spread),
         }))
     }
 
@@ -353,7 +409,7 @@ impl Refit<'_> {
 
     /// As many frames of a file as the training set has labels, in a file of their own.
     fn first_frames(&self, name: &str, file: &Path) -> Result<PathBuf, CommandError> {
-        let path = self.path(&format!("comparison-{name}.extxyz"));
+        let path = self.path(&format!("{COMPARISON}{name}.extxyz"));
         if path.exists() {
             return Ok(path);
         }
@@ -376,8 +432,8 @@ impl Refit<'_> {
         name: &str,
         labels: &Path,
     ) -> Result<Option<ComparisonFigures>, RefitFailure> {
-        kept(self.path(&format!("comparison-{name}.json")), async || {
-            let model = self.path(&format!("comparison-{name}.npz"));
+        kept(self.path(&format!("{COMPARISON}{name}.json")), async || {
+            let model = self.path(&format!("{COMPARISON}{name}.npz"));
             let what = format!("comparison with {name}");
             let Some(_) = self.train_natively(native, &what, labels, model.clone())? else { return Ok(None) };
             let structures = count_frames(labels)?;
@@ -411,7 +467,7 @@ impl Refit<'_> {
             labels: self.labels.count(LabelFile::Training),
             model_hash: of_file(MODEL)?,
             mixture_hash: of_file(MIXTURE)?,
-            figures,
+            figures: with_label_set(figures, &self.labels.label_set),
             seconds: cost.seconds,
             core_hours: cost.core_seconds / 3600.0,
             time: unix_milliseconds(),
@@ -429,11 +485,24 @@ impl Refit<'_> {
     fn read_files(&self) -> Result<VersionFiles, CommandError> {
         let read = |name: &str| {
             let path = self.path(name);
-            fs::read(&path)
-                .map_err(|error| CommandError::Failed(format!("cannot read {}: {error}", path.display())))
+            fs::read(&path).map_err(|error| cannot_read(&path, error))
         };
         Ok(VersionFiles { model: read(MODEL)?, mixture: read(MIXTURE)? })
     }
+}
+
+/// The figures with what tells whether labels are new since. The next attempt needs it of refused ones too.
+fn with_label_set(figures: Value, label_set: &str) -> Value {
+    let mut figures = if figures.is_object() { figures } else { json!({}) };
+    figures[LABEL_SET] = label_set.into();
+    figures
+}
+
+/// The figures of a refit that crashes: what its directory has of the labels that it was to train on.
+pub fn figures_of_crashed(campaign: &Path, number: u32) -> Value {
+    let path = campaign.join(FOLDER).join(number.to_string()).join("labels.json");
+    let labels = fs::read(path).ok().and_then(|bytes| serde_json::from_slice::<LabelFiles>(&bytes).ok());
+    labels.map_or(Value::Null, |labels| with_label_set(Value::Null, &labels.label_set))
 }
 
 /// A message that names the files of this directory by their names.

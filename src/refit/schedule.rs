@@ -223,6 +223,20 @@ mod tests {
         assert_eq!(schedule.in_force().unwrap().number, 3);
     }
 
+    #[test]
+    fn a_refit_by_time_needs_other_labels_or_structures() {
+        let refit = section("after_structures = 5\nafter_time = \"20s\"");
+        let mut schedule = schedule(4, 2);
+        schedule.progress.versions = vec![version(1, VersionState::Refused, 4)];
+        assert!(!schedule.is_due_beside_walks(&refit, 0, i64::MAX));
+        schedule.progress.has_new_labels = true;
+        assert!(
+            schedule.is_due_beside_walks(&refit, 0, 30_000)
+                && !schedule.is_due_beside_walks(&refit, 0, 29_999)
+        );
+        assert!(schedule.progress.is_refit_left());
+    }
+
     /// A structure whose label came too late for an attempt is trained on by the next one.
     #[test]
     fn attempts_without_labels_do_not_count_once_there_are_labels() {

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use monitor::refit_progress::LabelSplit;
 use potentials::grace::Precision;
 use serde::{Deserialize, Serialize};
 
@@ -66,6 +67,13 @@ pub struct RefitSettings {
 }
 
 impl RefitterConfig {
+    /// What labels are for.
+    pub fn label_split(&self) -> LabelSplit {
+        let RefitSettings { held_out, control_frames, .. } = self.settings;
+        let compares_controls = control_frames == ControlFrames::Compare;
+        LabelSplit { held_out, compares_controls, rng_seed: self.rng_seed }
+    }
+
     /// The model from which the version is trained.
     pub fn begin(&self) -> &HashedFile {
         match self.settings.start {

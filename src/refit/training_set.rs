@@ -1,21 +1,19 @@
 //! The labels of a campaign as files: to train on, to judge with, and to compare with.
 
-use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, HashSet};
 use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use atoms::extxyz::{ExtxyzWriteError, LabelKeys, write_frame};
-use monitor::refit_progress::{LabelPurpose, LabelSplit};
+use monitor::refit_progress::{LabelPurpose, LabelSet, LabelSplit};
 use serde::{Deserialize, Serialize};
 use store::{ExportCursor, ExportFilter, ExportRow, Store};
 use tokio_util::sync::CancellationToken;
 use wire::{WalkConditions, WalkId};
 
-use super::settings::RefitSettings;
 use crate::atomic_file::{AtomicFile, cannot_write};
-use crate::config::ControlFrames;
 use crate::exit_status::CommandError;
 use crate::export_frame;
 
@@ -44,6 +42,12 @@ pub struct LabelFiles {
     counts: BTreeMap<LabelFile, u64>,
     /// Decisions on the candidates of the training set.
     pub trained_on: Vec<i64>,
+    /// Decisions on the candidates of the other files.
+    pub others: Vec<i64>,
+    /// Numbers of the imported structures, which are all in the training set.
+    pub imports: Vec<i64>,
+    /// The [`LabelSet`] of the training set; empty without a protocol.
+    pub label_set: String,
 }
 
 /// One of the files.
@@ -56,7 +60,7 @@ pub enum LabelFile {
     HeldOut,
     /// Labels of control frames, if they are for comparisons.
     Control,
-    /// Labels of later decisions.
+    /// Labels that came after the training set was fixed.
     Since,
 }
 
@@ -85,21 +89,42 @@ impl LabelFiles {
     }
 }
 
+/// Which labels are written.
+pub enum LabelChoice<'a> {
+    /// Those until the last decision of the set, which it is fixed with.
+    OfSet,
+    /// Those that are in none of these files: they came since.
+    Since(&'a LabelFiles),
+}
+
 /// Where each label belongs.
-struct Sorter {
-    split: LabelSplit,
-    last_decision: i64,
+enum Sorter {
+    OfSet { split: LabelSplit, last_decision: i64 },
+    Since(HashSet<ExportCursor>),
 }
 
 impl Sorter {
-    /// The file of a row. `after`: labels after the last decision, otherwise those before.
-    fn file(&self, row: &ExportRow, after: bool) -> Option<LabelFile> {
-        let is_after =
-            matches!(row.cursor, ExportCursor::Candidate(decision) if decision > self.last_decision);
-        match (is_after, after) {
-            (true, true) => Some(LabelFile::Since),
-            (false, false) => Some(self.split.purpose(row).into()),
-            _ => None,
+    fn new(choice: &LabelChoice<'_>, split: LabelSplit, last_decision: i64) -> Self {
+        match choice {
+            LabelChoice::OfSet => Self::OfSet { split, last_decision },
+            LabelChoice::Since(LabelFiles { trained_on, others, imports, .. }) => {
+                let candidates =
+                    trained_on.iter().chain(others).map(|number| ExportCursor::Candidate(*number));
+                let imports = imports.iter().map(|number| ExportCursor::Import(*number));
+                Self::Since(candidates.chain(imports).collect())
+            }
+        }
+    }
+
+    /// The file of a row, if it has one.
+    fn file(&self, row: &ExportRow) -> Option<LabelFile> {
+        match self {
+            Self::OfSet { split, last_decision } => {
+                let is_later =
+                    matches!(row.cursor, ExportCursor::Candidate(decision) if decision > *last_decision);
+                (!is_later).then(|| split.purpose(row).into())
+            }
+            Self::Since(of_set) => (!of_set.contains(&row.cursor)).then_some(LabelFile::Since),
         }
     }
 }
@@ -114,23 +139,22 @@ impl From<LabelPurpose> for LabelFile {
     }
 }
 
-/// Writes the labels until the last decision of the set, or those after it. `None` after a cancellation of `stop`.
+/// Writes these labels. `None` after a cancellation of `stop`.
 ///
 /// # Errors
 /// The database, a full disk.
 pub async fn write(
     store: &Store,
     (directory, set): (&Path, &FrozenSet),
-    (settings, rng_seed): (&RefitSettings, u64),
-    after: bool,
+    split: LabelSplit,
+    choice: LabelChoice<'_>,
     stop: &CancellationToken,
 ) -> Result<Option<LabelFiles>, CommandError> {
     let mut found = LabelFiles::default();
     let Some(protocol) = store.protocol_in_force().await? else { return Ok(Some(found)) };
     let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: true };
-    let compares_controls = settings.control_frames == ControlFrames::Compare;
-    let split = LabelSplit { held_out: settings.held_out, compares_controls, rng_seed };
-    let sorter = Sorter { split, last_decision: set.last_decision };
+    let sorter = Sorter::new(&choice, split, set.last_decision);
+    let mut label_set = LabelSet::new(protocol.hash);
     let (campaign, conditions) = (store.campaign().await?.id.to_string(), store.walk_conditions().await?);
     let mut files = BTreeMap::new();
     let mut last = None;
@@ -142,14 +166,19 @@ pub async fn write(
             return Ok(None);
         }
         for row in page {
-            let Some(kind) = sorter.file(&row, after) else { continue };
+            let Some(kind) = sorter.file(&row) else { continue };
             let path = directory.join(kind.name());
             let file = match files.entry(kind) {
                 Entry::Occupied(file) => file.into_mut(),
                 Entry::Vacant(place) => place.insert(AtomicFile::create(&path)?),
             };
-            if let (LabelFile::Training, ExportCursor::Candidate(decision)) = (kind, row.cursor) {
-                found.trained_on.push(decision);
+            match (kind, row.cursor) {
+                (LabelFile::Training, ExportCursor::Candidate(decision)) => found.trained_on.push(decision),
+                (_, ExportCursor::Candidate(decision)) => found.others.push(decision),
+                (_, ExportCursor::Import(number)) => found.imports.push(number),
+            }
+            if kind == LabelFile::Training {
+                label_set.add(row.cursor, row.label.energy);
             }
             write_row(file, row, &campaign, &conditions).map_err(|error| cannot_write(&path, error))?;
             *found.counts.entry(kind).or_default() += 1;
@@ -160,6 +189,7 @@ pub async fn write(
             file.finish()?;
         }
     }
+    found.label_set = label_set.hash();
     Ok(Some(found))
 }
 

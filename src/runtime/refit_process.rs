@@ -5,10 +5,9 @@ use std::time::Duration;
 
 use orchestrator::launcher::{ChildEvent, Children, Launch};
 use orchestrator::selector::CampaignMode;
-use orchestrator::supervisor::{ChildState, Limits};
-use serde_json::Value;
+use orchestrator::supervisor::{ChildState, ExitReason, Limits};
 use store::{ProcessRecord, Store, StoreError, VersionRecord, VersionState, unix_milliseconds};
-use tokio::time::{MissedTickBehavior, interval};
+use tokio::time::{Instant, MissedTickBehavior, interval};
 
 use super::RunContext;
 use super::process_manager::all_failed_message;
@@ -18,6 +17,7 @@ use crate::exit_status::CommandError;
 use crate::log;
 use crate::output::{log_and_print, log_and_warn};
 use crate::process_config;
+use crate::refit;
 use crate::refit::schedule::RefitSchedule;
 use crate::refit::settings::RefitterConfig;
 
@@ -26,18 +26,31 @@ const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 /// A refit writes its own heartbeats, and a training takes as long as it takes: it is never considered hung.
 const NO_TIMEOUT: Duration = Duration::from_secs(1 << 32);
 
+/// Time after which a refit that cannot go on is tried again beside the walks of a live campaign.
+const RETRY_INTERVAL: Duration = Duration::from_secs(300);
+
+/// How a refit failed, after all its attempts.
+enum RefitEnd {
+    /// Its process reported what it cannot go on without: a disk, the database, a file of the configuration.
+    CannotGoOn(CommandError),
+    /// Its process crashed, or was killed.
+    Crashed(CommandError),
+}
+
 /// The refit of a run.
 pub struct RefitProcess<'a> {
     run: RunContext<'a>,
     refit: &'a RefitSection,
     /// While one is running.
     children: Option<Children>,
+    /// When the next one may begin, after one that could not go on.
+    wait_until: Option<Instant>,
 }
 
 impl<'a> RefitProcess<'a> {
     /// None is running yet.
     pub fn new(run: RunContext<'a>, refit: &'a RefitSection) -> Self {
-        Self { run, refit, children: None }
+        Self { run, refit, children: None, wait_until: None }
     }
 
     /// Starts a refit, unless one is running. [`Self::finish`] drives it.
@@ -62,15 +75,23 @@ impl<'a> RefitProcess<'a> {
     /// Runs the refit that is due to its end. Await it on the main thread, see [`orchestrator::launcher`].
     ///
     /// # Errors
-    /// A refit that fails again and again. The same run continues it.
+    /// A refit that cannot go on; in reproducible mode also one that crashes again and again. The same run continues it.
     pub async fn run_to_end(&mut self) -> Result<(), CommandError> {
         self.start()?;
         let stop = self.run.stop.clone();
-        tokio::select! {
-            ended = self.finish() => return ended,
-            () = stop.cancelled() => {}
+        let ended = tokio::select! {
+            ended = self.finish() => Some(ended),
+            () = stop.cancelled() => None,
+        };
+        match ended {
+            None => self.stop().await,
+            Some(Err(RefitEnd::Crashed(why))) if self.is_live() => self.refuse(&why).await,
+            Some(ended) => ended.map_err(CommandError::from),
         }
-        self.stop().await
+    }
+
+    fn is_live(&self) -> bool {
+        self.run.campaign.config.campaign.mode == CampaignMode::Live
     }
 
     /// Whether one is running.
@@ -83,26 +104,28 @@ impl<'a> RefitProcess<'a> {
         if let Some(children) = &mut self.children {
             children.stop();
         }
-        self.finish().await
+        self.finish().await.map_err(CommandError::from)
     }
 
     /// Beside the walks of a live campaign: starts refits that are due, and cancels [`RunContext::superseded`] or
     /// [`RunContext::walks_end`] when a version is registered that is newer than that of the walks. Never ends without an error.
     /// Cancel-safe.
     pub async fn watch(&mut self) -> CommandError {
-        if self.run.campaign.config.campaign.mode != CampaignMode::Live {
+        if !self.is_live() {
             return std::future::pending().await;
         }
         let mut ticks = interval(CHECK_INTERVAL);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
-                ended = self.finish(), if self.children.is_some() => {
-                    // The walks need no new version.
-                    if let Err(why) = ended && let Err(error) = self.refuse(&why).await {
+                // The walks need no new version.
+                ended = self.finish(), if self.children.is_some() => match ended {
+                    Ok(()) => {}
+                    Err(RefitEnd::CannotGoOn(why)) => self.try_again_later(&why),
+                    Err(RefitEnd::Crashed(why)) => if let Err(error) = self.refuse(&why).await {
                         return error;
-                    }
-                }
+                    },
+                },
                 _ = ticks.tick() => {}
             }
             match self.check().await {
@@ -115,12 +138,21 @@ impl<'a> RefitProcess<'a> {
         }
     }
 
-    /// Records that no version comes of a refit that fails again and again.
+    /// Leaves the refit where it is. Its directory keeps what it has done.
+    fn try_again_later(&mut self, why: &CommandError) {
+        self.wait_until = Some(Instant::now() + RETRY_INTERVAL);
+        log_and_warn(format_args!(
+            "{why}; the walks go on, and it is tried again after {} s",
+            RETRY_INTERVAL.as_secs()
+        ));
+    }
+
+    /// Records that no version comes of a refit that crashes again and again.
     async fn refuse(&self, why: &CommandError) -> Result<(), CommandError> {
         let RunContext { store, campaign, .. } = self.run;
-        let versions = store.versions().await?;
+        let number = 1 + store.versions().await?.last().map_or(0, |version| version.number);
         let record = VersionRecord {
-            number: 1 + versions.last().map_or(0, |version| version.number),
+            number,
             parent: campaign.version_number(),
             state: VersionState::Refused,
             reason: why.to_string(),
@@ -130,7 +162,7 @@ impl<'a> RefitProcess<'a> {
             labels: 0,
             model_hash: String::new(),
             mixture_hash: String::new(),
-            figures: Value::Null,
+            figures: refit::figures_of_crashed(self.run.directory, number),
             seconds: 0.0,
             core_hours: 0.0,
             time: unix_milliseconds(),
@@ -150,16 +182,18 @@ impl<'a> RefitProcess<'a> {
         } else if is_newer(schedule.newest()) {
             walks_end.cancel();
         } else if self.children.is_none()
+            && self.wait_until.is_none_or(|time| Instant::now() >= time)
             && schedule.is_due_beside_walks(self.refit, campaign_begin(store).await?, unix_milliseconds())
             && !is_another_running(store).await?
+            && let Err(why) = self.start()
         {
-            self.start()?;
+            self.try_again_later(&why);
         }
         Ok(())
     }
 
     /// Drives the running refit, if there is one, to its end. Cancel-safe.
-    async fn finish(&mut self) -> Result<(), CommandError> {
+    async fn finish(&mut self) -> Result<(), RefitEnd> {
         let Some(children) = &mut self.children else { return Ok(()) };
         loop {
             match children.next().await {
@@ -173,17 +207,32 @@ impl<'a> RefitProcess<'a> {
                     let _ = remove_dead(self.run.store).await;
                 }
                 ChildEvent::AllExited => {
-                    let failed = all_failed_message(children);
+                    let failed = how_it_failed(children);
                     self.children = None;
-                    return failed.map_or(Ok(()), |how| {
-                        Err(CommandError::Failed(format!(
-                            "the refit failed: {how}; the same command continues it"
-                        )))
-                    });
+                    return failed.map_or(Ok(()), Err);
                 }
             }
         }
     }
+}
+
+impl From<RefitEnd> for CommandError {
+    fn from(end: RefitEnd) -> Self {
+        let (RefitEnd::CannotGoOn(why) | RefitEnd::Crashed(why)) = end;
+        why
+    }
+}
+
+/// How the refit failed, if it did.
+fn how_it_failed(children: &mut Children) -> Option<RefitEnd> {
+    let how = all_failed_message(children)?;
+    let error = CommandError::Failed(format!("the refit failed: {how}; the same command continues it"));
+    let last = children.status().into_iter().next_back().and_then(|child| child.last_failure);
+    let is_reported = last.is_some_and(|reason| match reason {
+        ExitReason::StartFailed { .. } => true,
+        reason => matches!(reason, ExitReason::Exit { .. }) && !reason.is_crash(),
+    });
+    Some(if is_reported { RefitEnd::CannotGoOn(error) } else { RefitEnd::Crashed(error) })
 }
 
 /// When the campaign began, ms since 1970.

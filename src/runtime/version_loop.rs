@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use orchestrator::reactor::RunOutcome;
 use orchestrator::selector::{CampaignMode, Selector, SelectorSettings, SelectorSnapshot};
-use store::Store;
+use store::{Store, unix_milliseconds};
 use tokio_util::sync::CancellationToken;
 
 use super::refit_process::RefitProcess;
@@ -41,11 +41,18 @@ pub async fn run(
         };
         let run = RunContext { campaign: &campaign, ..run };
         let selector = restore_selector(&campaign, run.store).await?;
-        if selector.is_done() {
+        if selector.is_done() && !is_anything_left(&campaign, run.store).await? {
             return Ok(RunOutcome::Finished);
         }
         next = run_version(run, refit, selector, mode).await?;
     }
+}
+
+/// Whether a campaign whose walks have all ended has labels to wait for, or a version to train. Walks that made room for a version
+/// did not wait for theirs.
+async fn is_anything_left(campaign: &LoadedCampaign, store: &Store) -> Result<bool, CommandError> {
+    let schedule = RefitSchedule::read(store, &campaign.config).await?;
+    Ok(schedule.progress.is_refit_left() || store.has_pending_labels(unix_milliseconds()).await?)
 }
 
 /// What comes after the walks of a version.

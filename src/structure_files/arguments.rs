@@ -81,7 +81,7 @@ impl StructureReadingArgs {
         for path in data {
             check_format(path)?;
             let found = std::fs::metadata(path).map_err(|error| {
-                CommandError::Input(format!("{}: cannot be opened: {error}", path.display()))
+                CommandError::Unreadable(format!("{}: cannot be opened: {error}", path.display()))
             })?;
             if !found.is_file() {
                 return Err(CommandError::Input(format!(

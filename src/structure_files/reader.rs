@@ -79,7 +79,7 @@ impl StructureReader {
                 self.current = None;
                 continue;
             };
-            let frame = frame.map_err(CommandError::input)?;
+            let frame = frame?;
             self.in_file += 1;
             if matches(self.given.filter.as_ref(), &frame, file)? {
                 self.matching += 1;
@@ -114,8 +114,7 @@ impl StructureReader {
     fn open_next(&mut self) -> Result<bool, CommandError> {
         let Some(file) = self.files.pop_front() else { return Ok(false) };
         self.in_file = 0;
-        let structures = Structures::open(&file.path, &self.given.dump_elements, &self.bytes)
-            .map_err(CommandError::input)?;
+        let structures = Structures::open(&file.path, &self.given.dump_elements, &self.bytes)?;
         self.current = Some((file, structures));
         Ok(true)
     }

@@ -15,6 +15,7 @@ pub mod json;
 pub mod labels;
 pub mod reference_check;
 pub mod unlabelled;
+pub mod upfit;
 pub mod versions;
 pub mod walk_ends;
 pub mod walk_trace;

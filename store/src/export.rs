@@ -19,12 +19,23 @@ pub struct ExportFilter {
 }
 
 /// Position of a row in an export: candidates in decision order, then imports in import order.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum ExportCursor {
     /// Sequence number of the decision.
     Candidate(i64),
     /// Import number.
     Import(i64),
+}
+
+/// What tells one set of labels from another, without the structures and labels themselves.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LabelMark {
+    /// Its position.
+    pub cursor: ExportCursor,
+    /// Name of the seed structure and origin; `None` for an import.
+    pub walk: Option<(String, Origin)>,
+    /// Energy of the label, eV.
+    pub energy: f64,
 }
 
 /// A labelled structure.

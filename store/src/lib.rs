@@ -53,7 +53,7 @@ pub use candidate_history::{
 pub use check::Finding;
 pub use error::{Result, StoreError};
 pub use exclude::{ExcludedLabel, Exclusion, ExclusionChange};
-pub use export::{ArrivalSum, ExportCursor, ExportFilter, ExportRow, ExportSource, LabelArrival};
+pub use export::{ArrivalSum, ExportCursor, ExportFilter, ExportRow, ExportSource, LabelArrival, LabelMark};
 pub use file_names::{DATABASE, LOCK};
 pub use filesystem::{check_directory, free_space, network_file_system};
 pub use jobs::{

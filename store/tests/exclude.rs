@@ -2,8 +2,9 @@
 
 use serde_json::json;
 use store::{
-    Commit, CompleteOutcome, ExclusionChange, ExportFilter, Fate, JobState, LabelStatus, Lease, ListOrder,
-    ListedCandidate, Protocol, RelabelRequest, Store, StoreError, WalkRecord,
+    Commit, CompleteOutcome, ExclusionChange, ExportFilter, ExportRow, ExportSource, Fate, JobState,
+    LabelMark, LabelStatus, Lease, ListOrder, ListedCandidate, Protocol, RelabelRequest, Store, StoreError,
+    WalkRecord,
 };
 use wire::messages::DeclineReason;
 use wire::{ContentHash, Origin};
@@ -39,6 +40,18 @@ fn content(step: u64) -> ContentHash {
 async fn exported(store: &Store, protocol: &Protocol) -> Vec<f64> {
     let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: true };
     let rows = store.labelled(&filter, None, 100).await.unwrap();
+    let mark = |row: &ExportRow| LabelMark {
+        cursor: row.cursor,
+        walk: match &row.source {
+            ExportSource::Candidate { seed_structure_name, origin, .. } => {
+                Some((seed_structure_name.clone(), *origin))
+            }
+            ExportSource::Import { .. } => None,
+        },
+        energy: row.label.energy,
+    };
+    let expected: Vec<_> = rows.iter().map(mark).collect();
+    assert_eq!(store.label_marks(protocol.hash).await.unwrap(), expected);
     rows.iter().map(|row| row.label.energy).collect()
 }
 

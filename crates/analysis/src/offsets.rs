@@ -55,8 +55,8 @@ pub struct EnergyOffsets {
     inverse: Mat<f64>,
     /// Projection on the space spanned by their compositions.
     projection: Mat<f64>,
-    structures: usize,
-    left_out: usize,
+    /// Whether each labelled structure is in the fit, or left out.
+    used: Vec<bool>,
 }
 
 /// The offset of an element.
@@ -125,18 +125,24 @@ impl EnergyOffsets {
             solved = Solved::solve(&rows, &weights(&used), elements.len());
         }
         let Solved { offsets, inverse, projection } = solved;
-        let structures = used.iter().filter(|used| **used).count();
-        Ok(Self { elements, offsets, inverse, projection, structures, left_out: labels.len() - structures })
+        let mut used = used.into_iter();
+        let used = labels.iter().map(|label| is_possible(&label) && used.next() == Some(true)).collect();
+        Ok(Self { elements, offsets, inverse, projection, used })
     }
 
     /// Number of structures in the fit.
     pub fn structures(&self) -> usize {
-        self.structures
+        self.used.iter().filter(|used| **used).count()
     }
 
     /// Number of labelled structures that were left out as outliers.
     pub fn left_out(&self) -> usize {
-        self.left_out
+        self.used.len() - self.structures()
+    }
+
+    /// Whether each labelled structure is in the fit, or left out as an outlier.
+    pub fn used(&self) -> &[bool] {
+        &self.used
     }
 
     /// The offsets by ascending atomic number.

@@ -70,6 +70,19 @@ pub enum FileError {
     },
 }
 
+impl FileError {
+    /// Whether the operating system could not open or read the file, as opposed to what the file contains.
+    pub fn is_of_system(&self) -> bool {
+        match self {
+            Self::Open { .. } => true,
+            Self::Extxyz { fault, .. } => matches!(fault, extxyz::ExtxyzErrorKind::Io(_)),
+            Self::Poscar { fault, .. } => matches!(fault, poscar::PoscarErrorKind::Io(_)),
+            Self::LammpsDump { fault, .. } => matches!(fault, lammps_dump::DumpErrorKind::Io(_)),
+            Self::Format(_) | Self::NotExtxyz(_) | Self::Empty(_) => false,
+        }
+    }
+}
+
 /// How to convert a file to extended XYZ.
 fn conversion(path: &Path) -> String {
     format!("convert it with `ase convert {} {}`", path.display(), path.with_extension("extxyz").display())

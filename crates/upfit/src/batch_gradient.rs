@@ -1,5 +1,8 @@
 //! The gradient of one batch, over threads.
 
+use std::cmp::Reverse;
+use std::sync::{Mutex, PoisonError};
+
 use potentials::grace::{GradientWorker, Threads, TrainableGrace, WeightSums};
 
 use crate::differences::FrameDifferences;
@@ -8,7 +11,10 @@ use crate::frame_fault::FrameFault;
 use crate::loss::{BatchCounts, LossWeights, loss_gradient};
 use crate::prepared::PreparedFrame;
 
-/// Sums over structures, which all batches use again: a total, and those of the frames that are at work at a time.
+/// Frames for each thread until their sums are added: with more, threads wait less for the largest frame.
+const FRAMES_PER_THREAD: usize = 4;
+
+/// Sums over structures, which all batches use again: a total, and those of the frames that are at work together.
 pub struct BatchSums {
     total: WeightSums,
     slots: Vec<BatchSlot>,
@@ -25,8 +31,9 @@ struct BatchSlot {
 impl BatchSums {
     /// For these threads, each of which takes one frame at a time, and batches of at most `batch_size` frames.
     pub fn new(model: &TrainableGrace, threads: Threads, batch_size: usize) -> Self {
+        let at_work = if threads.count() > 1 { FRAMES_PER_THREAD * threads.count() } else { 1 };
         let slot = || BatchSlot { frame: 0, sums: model.sums(), outcome: Ok(FrameDifferences::default()) };
-        let slots = std::iter::repeat_with(slot).take(threads.count().min(batch_size).max(1)).collect();
+        let slots = std::iter::repeat_with(slot).take(at_work.min(batch_size).max(1)).collect();
         Self { total: model.sums(), slots, threads }
     }
 }
@@ -50,9 +57,9 @@ pub struct BatchGradient {
     pub not_finite: Vec<usize>,
 }
 
-/// The gradient of the loss of `batch`, indices of `frames`. As many frames as there are threads are at work at a time. Each
-/// has sums of its own, which are added to the total in the order of the batch, so that the result does not depend on the
-/// number of threads.
+/// The gradient of the loss of `batch`, indices of `frames`. Threads take one frame after another, the largest first, and then add
+/// up. Each frame has sums of its own, which are added to the total in the order of the batch, so that the result does not depend
+/// on the number of threads.
 ///
 /// # Errors
 /// A frame that the model cannot evaluate.
@@ -65,17 +72,21 @@ pub fn batch_gradient(
 ) -> Result<BatchGradient, UpfitError> {
     let counts = BatchCounts::new(batch.iter().map(|&index| frames[index].frame));
     let BatchSums { total, slots, threads } = sums;
-    total.clear();
-    let mut workers: Vec<_> = batch.iter().zip(slots.iter()).map(|_| model.worker()).collect();
+    let mut workers: Vec<_> = (0..threads.count().min(slots.len())).map(|_| model.worker()).collect();
     let mut differences = FrameDifferences::default();
     let mut not_finite = Vec::new();
-    for wave in batch.chunks(slots.len()) {
-        let slots = &mut slots[..wave.len()];
-        slots.iter_mut().zip(wave).for_each(|(slot, &index)| slot.frame = index);
-        let mut tasks: Vec<_> = slots.iter_mut().zip(&mut workers).collect();
-        threads.for_each(&mut tasks, |(slot, worker)| {
-            slot.sums.clear();
-            slot.outcome = frame_gradient(worker, &frames[slot.frame], loss, &counts, &mut slot.sums);
+    for (number, together) in batch.chunks(slots.len()).enumerate() {
+        let slots = &mut slots[..together.len()];
+        slots.iter_mut().zip(together).for_each(|(slot, &index)| slot.frame = index);
+        let mut queue: Vec<_> = slots.iter_mut().collect();
+        queue.sort_by_key(|slot| Reverse(frames[slot.frame].frame.structure.len()));
+        let queue = Mutex::new(queue.into_iter());
+        let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).next();
+        threads.for_each(&mut workers, |worker| {
+            while let Some(slot) = next() {
+                slot.sums.clear();
+                slot.outcome = frame_gradient(worker, &frames[slot.frame], loss, &counts, &mut slot.sums);
+            }
         });
         for slot in slots.iter() {
             let found = slot.outcome.clone().map_err(|fault| frames[slot.frame].frame.wrong(fault))?;
@@ -83,7 +94,11 @@ pub fn batch_gradient(
                 not_finite.push(slot.frame);
             }
             differences.merge(&found);
-            total.add(&slot.sums);
+        }
+        let sums: Vec<_> = slots.iter().map(|slot| &slot.sums).collect();
+        match number {
+            0 => total.set_to_sum(&sums, threads),
+            _ => total.add_all(&sums, threads),
         }
     }
     Ok(BatchGradient { differences, gradient: model.gradient(total), not_finite })
@@ -127,9 +142,10 @@ mod tests {
         let found =
             |sums: &mut BatchSums| batch_gradient(&model, &prepared, &[2, 0, 1], sums, &loss).unwrap();
         let one = found(&mut BatchSums::new(&model, Threads::default(), 3));
-        for threads in [2, 3, 5] {
-            let mut sums = BatchSums::new(&model, Threads::new(threads).unwrap(), 3);
-            assert_eq!(sums.slots.len(), threads.min(3));
+        // Batches of three frames at work together, and of two and one.
+        for (threads, together) in [(2, 3), (3, 3), (5, 3), (2, 2), (1, 1)] {
+            let mut sums = BatchSums::new(&model, Threads::new(threads).unwrap(), together);
+            assert_eq!(sums.slots.len(), together);
             // Sums are used again, and threads change no bit.
             for _ in 0..2 {
                 let other = found(&mut sums);

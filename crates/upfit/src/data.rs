@@ -13,6 +13,8 @@ pub struct LabelledFrame {
     pub place: String,
     /// Its seed structure, or another name of the structures that belong together. [`crate::split`] divides no group.
     pub group: String,
+    /// Number of the file that it comes from. [`crate::split`] divides each file by itself.
+    pub file: usize,
     /// The structure.
     pub structure: Structure,
     /// Total energy, eV.
@@ -49,7 +51,7 @@ impl LabelledFrame {
     ) -> Result<Self, UpfitError> {
         match checked(&structure, labels, weight) {
             Ok((energy, forces, stress)) => {
-                Ok(Self { place, group, structure, energy, forces, stress, weight })
+                Ok(Self { place, group, file: 0, structure, energy, forces, stress, weight })
             }
             Err(fault) => Err(UpfitError::Frame { place, fault }),
         }

@@ -17,6 +17,9 @@ const CONSTANT: f64 = 0.1;
 /// The share of the structures of which that is asked.
 const CONSTANT_SHARE: f64 = 0.9;
 
+/// Largest share of the error of a label that shifts may take up. Of one with more, the residual would show hardly anything.
+const MAX_LEVERAGE: f64 = 0.9;
+
 /// The weights that are added to the energy of each atom of an element.
 const SHIFTS: &str = "shift_values";
 
@@ -71,13 +74,14 @@ pub enum EnergyZeroFault {
 impl EnergyZero {
     /// Fits the shifts of the elements to the differences per atom. They are zero where labels and model have the same zero, up to
     /// 0.1 eV/atom. If the compositions do not determine the shifts, a difference that is the same for all structures is taken
-    /// for each element. [`Collinearity`] has the criterion; the structures of an element must also not all be outliers.
+    /// for each element. [`Collinearity`] has the criterion for the structures that are no outliers; an element must have some of
+    /// these, and no shift may depend on one of them alone. `places` are those of the structures, for the message.
     ///
     /// # Errors
     /// Compositions that do not determine the shifts, and a difference that is not the same for all structures.
-    pub fn find(energies: &[LabelledEnergy]) -> Result<Self, EnergyZeroFault> {
+    pub fn find(energies: &[LabelledEnergy], places: &[&str]) -> Result<Self, EnergyZeroFault> {
         let elements = elements(energies);
-        let weak = match determined_shifts(energies, &elements) {
+        let weak = match determined_shifts(energies, &elements, places) {
             Ok(shifts) => return Ok(Self::new(shifts, false)),
             Err(weak) => weak,
         };
@@ -158,26 +162,43 @@ fn elements(energies: &[LabelledEnergy]) -> Vec<u8> {
 }
 
 /// The shift of each element, if the compositions determine all of them well.
-fn determined_shifts(energies: &[LabelledEnergy], elements: &[u8]) -> Result<Vec<(u8, f64)>, WeakElements> {
-    let collinearity = Collinearity::of(energies, elements);
-    let fit = EnergyOffsets::fit(energies).map_err(|few| WeakElements {
-        elements: elements.to_vec(),
-        reason: format!("expected at least {} structures with energies", few.needed),
-    })?;
-    if !collinearity.elements.is_empty() {
-        let condition = collinearity.condition;
+fn determined_shifts(
+    energies: &[LabelledEnergy],
+    elements: &[u8],
+    places: &[&str],
+) -> Result<Vec<(u8, f64)>, WeakElements> {
+    let weak = |elements: Vec<u8>, reason: String| Err(WeakElements { elements, reason });
+    let fit = match EnergyOffsets::fit(energies) {
+        Ok(fit) => fit,
+        Err(few) => {
+            let reason = format!("expected at least {} structures with energies", few.needed);
+            return weak(elements.to_vec(), reason);
+        }
+    };
+    let used: Vec<_> =
+        energies.iter().zip(fit.used()).filter(|(_, used)| **used).map(|(label, _)| label.clone()).collect();
+    let of_used = self::elements(&used);
+    let missing: Vec<_> = elements.iter().copied().filter(|element| !of_used.contains(element)).collect();
+    if !missing.is_empty() {
+        let reason = "the energies of all structures with them are outliers, expected one that is none";
+        return weak(missing, reason.to_owned());
+    }
+    let Collinearity { condition, elements } = Collinearity::of(&used, &of_used);
+    if !elements.is_empty() {
         let reason = format!("their condition number is {condition:.1e}, expected at most {MAX_CONDITION}");
-        return Err(WeakElements { elements: collinearity.elements, reason });
+        return weak(elements, reason);
     }
-    let found: Vec<_> = fit.elements().filter(|found| found.is_separate).collect();
-    let is_found = |element: &u8| found.iter().any(|found| found.element == *element);
-    let weak: Vec<_> = elements.iter().copied().filter(|element| !is_found(element)).collect();
-    if !weak.is_empty() {
-        let reason =
-            "the energies of all structures with them are outliers, expected one that is none".to_owned();
-        return Err(WeakElements { elements: weak, reason });
+    let decides = |label: &LabelledEnergy| fit.support(&label.composition) * MAX_LEVERAGE < 1.0;
+    let alone = energies.iter().zip(fit.used()).position(|(label, used)| *used && decides(label));
+    if let Some(alone) = alone {
+        let place = places.get(alone).copied().unwrap_or("one structure");
+        let elements = energies[alone].composition.iter().map(|(element, _)| *element).collect();
+        return weak(
+            elements,
+            format!("{place} alone decides them, expected at least one more such structure"),
+        );
     }
-    Ok(found.iter().map(|found| (found.element, found.offset)).collect())
+    Ok(fit.elements().map(|found| (found.element, found.offset)).collect())
 }
 
 /// A quantile; 0 without numbers.
@@ -201,12 +222,17 @@ mod tests {
         compositions.iter().map(energy).collect()
     }
 
+    fn find(energies: &[LabelledEnergy]) -> Result<EnergyZero, EnergyZeroFault> {
+        let places: Vec<_> = (1..=energies.len()).map(|line| format!("a.xyz:{line}")).collect();
+        EnergyZero::find(energies, &places.iter().map(String::as_str).collect::<Vec<_>>())
+    }
+
     const ALLOYS: [(u32, u32); 5] = [(4, 0), (3, 1), (1, 3), (0, 4), (2, 2)];
     const ONE_ALLOY: [(u32, u32); 4] = [(2, 2), (4, 4), (8, 8), (1, 1)];
 
     #[test]
     fn each_element_has_its_shift() {
-        let zero = EnergyZero::find(&energies(&ALLOYS, |al, ni| -100.0 * al + 7.0 * ni)).unwrap();
+        let zero = find(&energies(&ALLOYS, |al, ni| -100.0 * al + 7.0 * ni)).unwrap();
         assert!(!zero.is_constant && zero.shifts.len() == 2);
         assert!((zero.of(&[(13, 2), (28, 1)]) + 193.0).abs() < 1e-9, "{zero:?}");
 
@@ -224,16 +250,16 @@ mod tests {
     #[test]
     fn errors_of_the_model_are_no_other_zero() {
         for compositions in [&ALLOYS[..], &ONE_ALLOY] {
-            let zero = EnergyZero::find(&energies(compositions, |al, ni| 0.05 * al - 0.02 * ni)).unwrap();
+            let zero = find(&energies(compositions, |al, ni| 0.05 * al - 0.02 * ni)).unwrap();
             assert_eq!(zero, EnergyZero::default());
         }
-        assert_eq!(EnergyZero::find(&[]).unwrap(), EnergyZero::default());
+        assert_eq!(find(&[]).unwrap(), EnergyZero::default());
     }
 
     #[test]
     fn a_constant_needs_no_compositions() {
         for compositions in [&ONE_ALLOY[..], &ONE_ALLOY[..1]] {
-            let zero = EnergyZero::find(&energies(compositions, |al, ni| 5.0 * (al + ni))).unwrap();
+            let zero = find(&energies(compositions, |al, ni| 5.0 * (al + ni))).unwrap();
             assert!(zero.is_constant && (zero.of(&[(28, 3)]) - 15.0).abs() < 1e-9, "{zero:?}");
         }
     }
@@ -241,12 +267,12 @@ mod tests {
     #[test]
     fn shifts_that_are_not_determined_are_refused() {
         let energies = energies(&ONE_ALLOY, |al, ni| (al + ni) * (5.0 + 0.3 * al));
-        let fault = EnergyZero::find(&energies).unwrap_err().to_string();
+        let fault = find(&energies).unwrap_err().to_string();
         assert!(
             fault.contains("the compositions of 4 structures") && fault.contains("Al, Ni: their"),
             "{fault}"
         );
-        let fault = EnergyZero::find(&energies[..2]).unwrap_err().to_string();
+        let fault = find(&energies[..2]).unwrap_err().to_string();
         assert!(fault.contains("expected at least 3 structures"), "{fault}");
     }
 
@@ -254,10 +280,10 @@ mod tests {
     fn compositions_that_hardly_differ_do_not_determine_shifts() {
         let zeros = |al: f64, ni: f64| -100.0 * al + 7.0 * ni;
         let close = energies(&[(50, 50), (51, 49), (49, 51), (50, 50)], zeros);
-        let fault = EnergyZero::find(&close).unwrap_err().to_string();
+        let fault = find(&close).unwrap_err().to_string();
         assert!(fault.contains("Al, Ni: their condition number is 7.1e1, expected at most 30"), "{fault}");
         let apart = energies(&[(50, 50), (60, 40), (40, 60), (50, 50)], zeros);
-        assert!((EnergyZero::find(&apart).unwrap().of(&[(13, 1)]) + 100.0).abs() < 1e-6);
+        assert!((find(&apart).unwrap().of(&[(13, 1)]) + 100.0).abs() < 1e-6);
     }
 
     #[test]
@@ -265,7 +291,49 @@ mod tests {
         // Energies beyond 10⁷ eV/atom count for nothing.
         let mut energies = energies(&[(4, 0), (3, 0), (2, 0), (0, 4)], |al, ni| 5.0 * al + 1e9 * ni);
         energies[1].label += 9.0;
-        let fault = EnergyZero::find(&energies).unwrap_err().to_string();
+        let fault = find(&energies).unwrap_err().to_string();
         assert!(fault.contains("the shifts of Ni: the energies of all structures with them"), "{fault}");
+    }
+
+    /// Otherwise an absurd energy would be fitted exactly, and no residual would show it.
+    #[test]
+    fn no_shift_depends_on_one_structure() {
+        let mut compositions = vec![(4, 2); 199];
+        compositions.push((0, 3));
+        let other_zeros = |al: f64, ni: f64| -13.0 * al - 430.0 * ni;
+        let fault = find(&energies(&compositions, other_zeros)[100..]).map(|zero| zero.is_constant);
+        assert_eq!(fault, Ok(true), "the others have a constant difference");
+        // A wrong energy remains where it is.
+        let mut wrong = energies(&compositions, |_, _| 0.0);
+        wrong[199].label += 450.0;
+        assert_eq!(find(&wrong), Ok(EnergyZero::default()));
+        // Two such structures decide together, and a wrong one of three is an outlier.
+        compositions.push((0, 6));
+        let zero = find(&energies(&compositions, other_zeros)).unwrap();
+        assert!(
+            (zero.of(&[(13, 1)]) + 13.0).abs() < 1e-6 && (zero.of(&[(28, 1)]) + 430.0).abs() < 1e-6,
+            "{zero:?}"
+        );
+        compositions.push((0, 9));
+        let mut wrong = energies(&compositions, other_zeros);
+        wrong[199].label += 450.0;
+        let zero = find(&wrong).unwrap();
+        assert!((zero.of(&[(28, 1)]) + 430.0).abs() < 1e-6, "{zero:?}");
+        // Where the others differ too, the structure is named.
+        let varied: Vec<_> = (1..30).map(|number| (number, number)).chain([(0, 3)]).collect();
+        let fault = find(&energies(&varied, |al, ni| 0.02 * al * al - 430.0 * ni)).unwrap_err().to_string();
+        assert!(fault.contains("the shifts of Ni: a.xyz:30 alone decides them"), "{fault}");
+    }
+
+    /// What is left out of the fit tells no elements apart.
+    #[test]
+    fn outliers_do_not_determine_compositions() {
+        let mut compositions = vec![(2, 2); 20];
+        compositions.extend([(4, 0), (0, 4)]);
+        let mut labels = energies(&compositions, |al, ni| 5.0 * al + 7.0 * ni);
+        labels[20].label += 4e3;
+        labels[21].label -= 9e3;
+        let zero = find(&labels).unwrap();
+        assert!(zero.is_constant && (zero.of(&[(13, 1)]) - 6.0).abs() < 1e-9, "{zero:?}");
     }
 }

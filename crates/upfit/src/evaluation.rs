@@ -100,7 +100,7 @@ pub fn zero_of_labels(
             label: frame.energy,
         }));
     }
-    Ok(Some(EnergyZero::find(&energies).unwrap_or_default()))
+    Ok(Some(EnergyZero::find(&energies, &[]).unwrap_or_default()))
 }
 
 /// The errors of a model, with this zero of its energies, on these frames. The loss is that of the demonstration

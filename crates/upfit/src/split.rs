@@ -11,8 +11,10 @@ use crate::error::UpfitError;
 const SPLIT: u64 = u64::MAX;
 
 /// Takes about this share of the frames for validation: whole groups (seed structures) in random order, each that still fits, but
-/// not all. If none fits, the smallest group is taken, the first such in that order. The choice is a function of the order of the
-/// groups and of `seed`. With a share of 0 there is no validation.
+/// not all. If none fits, the smallest group is taken, the first such in that order. Each file is divided by itself, so that a large
+/// file of small groups does not take the place of a small one of large groups. Files of which the share is less than one frame are
+/// divided together, and so are those with a single group. The choice is a function of the order of the groups and of `seed`. With a
+/// share of 0 there is no validation.
 ///
 /// # Errors
 /// No frames; a single group, which cannot be divided.
@@ -29,8 +31,10 @@ pub fn split(frames: Vec<LabelledFrame>, share: f64, seed: u64) -> Result<Traini
         return Err(UpfitError::OneGroup { share, structures, group });
     }
     let mut is_validation = vec![false; frames.len()];
-    for group in held_out(&groups, share, seed) {
-        groups[group].iter().for_each(|&frame| is_validation[frame] = true);
+    for (stream, part) in (0..=SPLIT).rev().zip(parts(&groups, share)) {
+        for group in held_out(&part, share, (seed, stream)) {
+            group.frames.iter().for_each(|&frame| is_validation[frame] = true);
+        }
     }
     let mut data = TrainingData::default();
     for (frame, is_validation) in frames.into_iter().zip(is_validation) {
@@ -39,33 +43,58 @@ pub fn split(frames: Vec<LabelledFrame>, share: f64, seed: u64) -> Result<Traini
     Ok(data)
 }
 
-/// Indices of the groups for validation, of two or more: at least one, and not all.
-fn held_out(groups: &[Vec<usize>], share: f64, seed: u64) -> Vec<usize> {
-    let all: usize = groups.iter().map(Vec::len).sum();
+/// Frames that stay together.
+struct FrameGroup {
+    /// The file of the first of them.
+    file: usize,
+    /// Their indices.
+    frames: Vec<usize>,
+}
+
+/// The groups that are divided by themselves: those of each large file, and those of the small ones together. A part with a single
+/// group is left out.
+fn parts(groups: &[FrameGroup], share: f64) -> Vec<Vec<&FrameGroup>> {
+    let mut files = BTreeMap::<usize, Vec<&FrameGroup>>::new();
+    groups.iter().for_each(|group| files.entry(group.file).or_default().push(group));
+    let is_large = |part: &[&FrameGroup]| part.len() > 1 && share * number_of_frames(part) as f64 >= 1.0;
+    let (mut parts, small): (Vec<_>, Vec<_>) = files.into_values().partition(|part| is_large(part));
+    parts.push(small.concat());
+    parts.retain(|part| part.len() > 1);
+    parts
+}
+
+fn number_of_frames(groups: &[&FrameGroup]) -> usize {
+    groups.iter().map(|group| group.frames.len()).sum()
+}
+
+/// Those of two or more groups for validation: at least one, and not all. `random` is the random seed and its use.
+fn held_out<'a>(groups: &[&'a FrameGroup], share: f64, random: (u64, u64)) -> Vec<&'a FrameGroup> {
+    let all = number_of_frames(groups);
     let limit = ((share * all as f64).ceil() as usize).min(all - 1);
-    let order = shuffled(seed, SPLIT, groups.len());
+    let (seed, stream) = random;
+    let order: Vec<_> = shuffled(seed, stream, groups.len()).into_iter().map(|index| groups[index]).collect();
     let mut taken = 0;
-    let fits = |&group: &usize| {
-        let with_it = taken + groups[group].len();
+    let fits = |group: &&FrameGroup| {
+        let with_it = taken + group.frames.len();
         let fits = with_it <= limit;
         taken = if fits { with_it } else { taken };
         fits
     };
     let fitting: Vec<_> = order.iter().copied().filter(fits).collect();
     if fitting.is_empty() {
-        return order.into_iter().min_by_key(|&group| groups[group].len()).into_iter().collect();
+        return order.into_iter().min_by_key(|group| group.frames.len()).into_iter().collect();
     }
     fitting
 }
 
-/// Indices of the frames of each group, in the order in which the groups come.
-fn groups(frames: &[LabelledFrame]) -> Vec<Vec<usize>> {
-    let (mut known, mut groups) = (BTreeMap::new(), Vec::<Vec<usize>>::new());
+/// The groups, in the order in which they come.
+fn groups(frames: &[LabelledFrame]) -> Vec<FrameGroup> {
+    let (mut known, mut groups) = (BTreeMap::new(), Vec::<FrameGroup>::new());
     for (index, frame) in frames.iter().enumerate() {
         let group = *known.entry(frame.group.as_str()).or_insert(groups.len());
         match groups.get_mut(group) {
-            Some(members) => members.push(index),
-            None => groups.push(vec![index]),
+            Some(group) => group.frames.push(index),
+            None => groups.push(FrameGroup { file: frame.file, frames: vec![index] }),
         }
     }
     groups
@@ -116,6 +145,50 @@ mod tests {
             // The largest share leaves a group to train with.
             let data = split(frames(&["a", "b"]), 0.9, seed).unwrap();
             assert_eq!((data.training.len(), data.validation.len()), (1, 1));
+        }
+    }
+
+    /// These numbers of frames in groups of these sizes, a file each.
+    fn files(all: &[(usize, usize)]) -> Vec<LabelledFrame> {
+        let frame = aluminium(1).remove(0);
+        let of_file = |(file, &(frames, size)): (usize, &(usize, usize))| {
+            let frame = frame.clone();
+            (0..frames).map(move |number| LabelledFrame {
+                place: format!("{file}:{number}"),
+                group: format!("{file}: {}", number / size),
+                file,
+                ..frame.clone()
+            })
+        };
+        all.iter().enumerate().flat_map(of_file).collect()
+    }
+
+    /// Number of frames of each file for validation.
+    fn held_out_by_file(all: &[(usize, usize)], share: f64, seed: u64) -> Vec<usize> {
+        let data = split(files(all), share, seed).unwrap();
+        let of = |file| data.validation.iter().filter(|frame| frame.file == file).count();
+        (0..all.len()).map(of).collect()
+    }
+
+    /// Replay data of single frames, and few seed structures with many labels each.
+    #[test]
+    fn validation_has_structures_of_each_file() {
+        for seed in 0..20 {
+            for (replay, labels, expected) in [
+                ((50, 1), (54, 9), [5, 9]),
+                ((200, 1), (80, 10), [20, 10]),
+                ((40, 1), (60, 15), [4, 15]),
+                ((40, 1), (200, 10), [4, 20]),
+                // A single seed structure is not divided.
+                ((40, 1), (30, 30), [4, 0]),
+            ] {
+                assert_eq!(held_out_by_file(&[replay, labels], 0.1, seed), expected, "{replay:?} {labels:?}");
+            }
+            // Small files together lose the share too, and no more.
+            let held: usize = held_out_by_file(&[(2, 1); 20], 0.1, seed).iter().sum();
+            assert_eq!(held, 4);
+            let held: usize = held_out_by_file(&[(1, 1); 30], 0.1, seed).iter().sum();
+            assert_eq!(held, 3);
         }
     }
 

@@ -46,6 +46,7 @@ pub fn settings(threshold: f64) -> SelectorSettings {
         max_per_seed_structure: None,
         max_structures: None,
         max_steps_without_structure: None,
+        stop_groups: Vec::new(),
         control: false,
         control_share: 0.5,
         min_distances: MinDistanceRule::Uniform(Uniform::default()),

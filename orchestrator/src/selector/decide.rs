@@ -59,7 +59,7 @@ impl DecisionState {
                 }
                 Outcome::StepsDone | Outcome::Interrupted => {}
             }
-            self.count_steps(steps, self.accepted > accepted);
+            self.count_steps(id, steps, self.accepted > accepted);
         }
         self.finish_commit(assigned, touched, &mut commit);
         Ok(commit)
@@ -113,9 +113,13 @@ impl DecisionState {
         steps
     }
 
-    /// Counts the steps of biased walks since the last accepted structure. Structures of assignments that were under way when
-    /// the limit was reached are accepted, but the limit stays reached.
-    fn count_steps(&mut self, steps: u64, found: bool) {
+    /// Counts the steps of biased walks since the last accepted structure, of the groups that count. Structures of assignments that
+    /// were under way when the limit was reached are accepted, but the limit stays reached.
+    fn count_steps(&mut self, id: WalkId, steps: u64, found: bool) {
+        let (groups, group) = (&self.settings.stop_groups, &self.walks[id].record.conditions.group);
+        if !groups.is_empty() && !groups.contains(group) {
+            return;
+        }
         if !found {
             self.steps_without_structure += steps;
         } else if !self.finds_nothing_new() {

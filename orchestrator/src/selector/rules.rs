@@ -27,6 +27,9 @@ pub struct ChangeableRules {
     /// See [`SelectorSettings::max_steps_without_structure`].
     #[serde(rename = "stop.max_steps_without_structure")]
     pub max_steps_without_structure: Option<u64>,
+    /// See [`SelectorSettings::stop_groups`].
+    #[serde(rename = "stop.walks", default, skip_serializing_if = "Vec::is_empty")]
+    pub stop_groups: Vec<String>,
     /// See [`ForgettingAlarm`].
     #[serde(rename = "calm.forgetting_alarm")]
     pub forgetting_alarm: Fraction,
@@ -51,6 +54,7 @@ impl SelectorSettings {
             max_per_seed_structure: self.max_per_seed_structure,
             max_structures: self.max_structures,
             max_steps_without_structure: self.max_steps_without_structure,
+            stop_groups: self.stop_groups.clone(),
             forgetting_alarm: self.forgetting_alarm.share_above_one,
             max_mean_square_growth: self.forgetting_alarm.mean_square_growth,
         }
@@ -63,12 +67,13 @@ impl SelectorSettings {
             max_per_seed_structure,
             max_structures,
             max_steps_without_structure,
+            stop_groups,
             forgetting_alarm,
             max_mean_square_growth,
-        } = *rules;
+        } = rules.clone();
         (self.max_per_walk, self.max_structures) = (max_per_walk, max_structures);
         self.max_per_seed_structure = max_per_seed_structure;
-        self.max_steps_without_structure = max_steps_without_structure;
+        (self.max_steps_without_structure, self.stop_groups) = (max_steps_without_structure, stop_groups);
         self.forgetting_alarm =
             ForgettingAlarm { share_above_one: forgetting_alarm, mean_square_growth: max_mean_square_growth };
     }

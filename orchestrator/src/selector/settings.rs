@@ -92,6 +92,8 @@ pub struct SelectorSettings {
     pub max_structures: Option<u32>,
     /// Maximum number of steps that the biased walks make together after the last accepted structure, equilibration included.
     pub max_steps_without_structure: Option<u64>,
+    /// Groups of walks whose steps and structures count for that; empty: all.
+    pub stop_groups: Vec<String>,
     /// Whether each biased walk that collected structures is followed by its unbiased control walk.
     pub control: bool,
     /// Share of the assignments that control walks get while there are any (live mode).

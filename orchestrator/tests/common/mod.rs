@@ -97,6 +97,7 @@ pub fn settings(mode: CampaignMode) -> SelectorSettings {
         max_per_seed_structure: None,
         max_structures: None,
         max_steps_without_structure: None,
+        stop_groups: Vec::new(),
         control: false,
         control_share: 0.5,
         min_distances: MinDistanceRule::Uniform(Uniform::default()),
@@ -114,6 +115,16 @@ pub fn completes_up_to(gamma: f64) -> CompletionCoefficients {
 
 pub fn restore(settings: &SelectorSettings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
     try_restore(settings, seeds, None, snapshot).unwrap()
+}
+
+/// A selector with these seed structures.
+pub fn restore_with(
+    settings: &SelectorSettings,
+    seeds: Vec<SeedStructurePlan>,
+    snapshot: SelectorSnapshot,
+) -> Selector {
+    let original = mixture_of(settings.version.version);
+    Selector::restore(settings.clone(), CAMPAIGN, seeds, grader(), original, None, snapshot).unwrap()
 }
 
 pub fn try_restore(

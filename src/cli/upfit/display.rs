@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use ::upfit::{EpochRecord, SetErrors, TrainingEvent, UpdateProgress};
 
-use super::report::{spread_text, zero_text};
 use crate::output::{Bar, count, log_and_warn, print_stderr};
+use crate::wording;
 
 /// Time between two lines within an epoch.
 const LINE_INTERVAL: Duration = Duration::from_secs(30);
@@ -36,10 +36,10 @@ impl TrainingDisplay {
                         print_stderr(format_args!("continuing from {path}: {epochs} finished"));
                     });
                 }
-                if let Some(text) = zero_text(zero) {
+                if let Some(text) = wording::upfit::zero(zero) {
                     self.bar.suspend(|| print_stderr(text));
                 }
-                if let Some(text) = spread_text(spread) {
+                if let Some(text) = wording::upfit::spread(spread) {
                     self.bar.suspend(|| log_and_warn(text));
                 }
             }
@@ -74,7 +74,7 @@ fn update_text(progress: &UpdateProgress) -> String {
         errors_text(&progress.errors),
         progress.learning_rate,
         progress.updates_per_second,
-        left_text(progress.seconds_left)
+        wording::upfit::time_left(progress.seconds_left)
     )
 }
 
@@ -93,7 +93,7 @@ fn epoch_text(record: &EpochRecord, seconds_left: Option<f64>) -> String {
         validation.unwrap_or_default(),
         record.learning_rate,
         record.updates_per_second,
-        left_text(seconds_left)
+        wording::upfit::time_left(seconds_left)
     )
 }
 
@@ -101,11 +101,6 @@ fn epoch_text(record: &EpochRecord, seconds_left: Option<f64>) -> String {
 fn errors_text(errors: &SetErrors) -> String {
     let stress = errors.stress_mae.map(|stress| format!(", {stress:.2e} eV/Å³")).unwrap_or_default();
     format!("MAE {:.2e} eV/atom, {:.2e} eV/Å{stress}", errors.energy_mae, errors.force_mae)
-}
-
-fn left_text(seconds: Option<f64>) -> String {
-    let left = seconds.map(|seconds| Duration::from_secs_f64(seconds.clamp(0.0, 1e10)));
-    left.map(|left| format!(", {} left", indicatif::HumanDuration(left))).unwrap_or_default()
 }
 
 #[cfg(test)]

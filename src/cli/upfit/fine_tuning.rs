@@ -1,9 +1,10 @@
 //! A training from files to a file: reads the data, trains, and writes model and figure.
 
+use std::collections::HashSet;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use ::upfit::{TrainingData, TrainingEvent, UpfitOutcome, UpfitSettings};
+use ::upfit::{LabelledFrame, TrainingData, TrainingEvent, UpfitOutcome, UpfitSettings, data_hash};
 use figures::to_svg;
 use potentials::grace::TrainableGrace;
 use serde_json::Value;
@@ -14,7 +15,7 @@ use super::paths::check_paths;
 use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::cli::CommandError;
 use crate::labelled_frames::{DataFile, check_formats, command_error, read_frames};
-use crate::output::{count, print_stderr};
+use crate::output::{count, log_and_warn, print_stderr};
 use crate::structure_files::StructureFiles;
 use crate::upfit_run::{self, UpfitRun};
 
@@ -94,6 +95,8 @@ fn read_data(
         None => ::upfit::split(frames, request.validation_share, settings.seed).map_err(command_error)?,
         Some(files) => {
             let Some((validation, others)) = read_frames(files, stop)? else { return Ok(None) };
+            others.iter().try_for_each(|file| file.refuse_copy(&sources))?;
+            warn_of_known_structures(&frames, &validation);
             sources.extend(others.into_iter().map(DataFile::for_validation));
             TrainingData { training: frames, validation }
         }
@@ -109,6 +112,24 @@ fn read_data(
         count(validation as u64, "structure")
     ));
     Ok(Some((data, sources)))
+}
+
+/// Warns of structures of the validation set that the model is trained with: its errors would be too small.
+fn warn_of_known_structures(training: &[LabelledFrame], validation: &[LabelledFrame]) {
+    let hash = |frame: &LabelledFrame| {
+        data_hash(std::slice::from_ref(&LabelledFrame { weight: 1.0, ..frame.clone() }))
+    };
+    let known: HashSet<_> = training.iter().map(hash).collect();
+    let mut both = validation.iter().filter(|frame| known.contains(&hash(frame)));
+    if let Some(first) = both.next() {
+        let number = 1 + both.count() as u64;
+        log_and_warn(format_args!(
+            "{} of the validation set, such as {}, {} in the training set too: validation errors are too small",
+            count(number, "structure"),
+            first.place,
+            if number == 1 { "is" } else { "are" }
+        ));
+    }
 }
 
 fn write_curves(path: &Path, outcome: &UpfitOutcome) -> Result<(), CommandError> {

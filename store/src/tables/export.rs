@@ -11,7 +11,7 @@ use crate::checksum::{CANDIDATE, DECISION, IMPORT, Names, ORIGINAL_GRADES, SEED_
 use crate::database::{FromRow, SqlRow, query};
 use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
-use crate::export::{ExportCursor, ExportFilter, ExportRow, ExportSource};
+use crate::export::{ExportCursor, ExportFilter, ExportRow, ExportSource, LabelMark};
 
 pub(crate) const CANDIDATES: &str = concat!(
     "SELECT candidate.decision AS decision, original_checksum, block, original_grades, seed_structure.seed AS seed, ",
@@ -52,6 +52,26 @@ pub(crate) const IMPORTS: &str = concat!(
     ORDER BY import.number LIMIT $3"
 );
 
+/// The rows of [`CANDIDATES`] with few of their columns.
+const CANDIDATE_MARKS: &str =
+    "SELECT candidate.decision AS place, candidate.origin AS origin, seed_structure.name AS name,
+    label.energy AS energy
+    FROM candidate
+    CROSS JOIN label ON label.structure = candidate.structure AND label.protocol = $1 AND status = 'label'
+    LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
+    WHERE NOT EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure AND job.protocol = $1
+                    AND state = 'dropped')
+    ORDER BY candidate.decision";
+
+/// The rows of [`IMPORTS`] with few of their columns.
+const IMPORT_MARKS: &str = "SELECT import.number AS place, label.energy AS energy
+    FROM import
+    CROSS JOIN label ON label.structure = import.structure AND label.protocol = $1 AND status = 'label'
+    WHERE NOT EXISTS (SELECT 1 FROM candidate WHERE candidate.structure = import.structure)
+    AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = import.structure AND job.protocol = $1
+                    AND state = 'dropped')
+    ORDER BY import.number";
+
 /// Hashes of structures collected from both biased and control walks.
 const OF_BOTH_ORIGINS: &str = "SELECT DISTINCT content FROM candidate WHERE origin = 'control'
     AND EXISTS (SELECT 1 FROM candidate other WHERE other.structure = candidate.structure AND other.origin = 'biased')";
@@ -78,6 +98,28 @@ impl Store {
     pub async fn structures_of_both_origins(&self) -> Result<HashSet<ContentHash>> {
         let hashes: Vec<Vec<u8>> = query(OF_BOTH_ORIGINS).fetch_all(&self.database).await?;
         hashes.iter().map(|hash| decode_hash(hash)).collect()
+    }
+
+    /// The labels of a protocol that [`Self::labelled`] reads, in its order. For questions that are asked often.
+    pub async fn label_marks(&self, protocol: ContentHash) -> Result<Vec<LabelMark>> {
+        let number = query("SELECT number FROM protocol WHERE hash = $1").bind(protocol.0.to_vec());
+        let Some(number) = number.fetch_optional::<i64>(&self.database).await? else { return Ok(Vec::new()) };
+        let mut marks = Vec::new();
+        for row in query(CANDIDATE_MARKS).bind(number).rows(&self.database).await? {
+            marks.push(LabelMark {
+                cursor: ExportCursor::Candidate(row.get("place")?),
+                walk: Some((
+                    row.get::<Option<String>>("name")?.unwrap_or_default(),
+                    origin(&row.get::<String>("origin")?)?,
+                )),
+                energy: row.get("energy")?,
+            });
+        }
+        for row in query(IMPORT_MARKS).bind(number).rows(&self.database).await? {
+            let cursor = ExportCursor::Import(row.get("place")?);
+            marks.push(LabelMark { cursor, walk: None, energy: row.get("energy")? });
+        }
+        Ok(marks)
     }
 
     /// At most `limit` labelled structures after `after` (`None`: from the first): candidates in decision order,

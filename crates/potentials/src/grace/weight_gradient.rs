@@ -84,9 +84,14 @@ impl<V: Vector> WeightGradient<V> {
         self.sums.iter_mut().zip(&other.sums).for_each(|(sum, x)| sum.add(x));
     }
 
-    /// Sets all to zero.
-    pub fn clear(&mut self) {
-        self.sums.fill(V::ZERO);
+    /// All sums.
+    pub fn flat(&self) -> &[V::Number] {
+        V::flat(&self.sums)
+    }
+
+    /// The same.
+    pub fn flat_mut(&mut self) -> &mut [V::Number] {
+        V::flat_mut(&mut self.sums)
     }
 
     /// `[type, input, output]`

@@ -81,7 +81,8 @@ impl<'a> Trainer<'a> {
             label: prepared.frame.energy,
         };
         let energies: Vec<_> = self.training.iter().zip(training).map(labelled).collect();
-        let zero = EnergyZero::find(&energies)?;
+        let places: Vec<_> = self.training.iter().map(|prepared| prepared.frame.place.as_str()).collect();
+        let zero = EnergyZero::find(&energies, &places)?;
         let validated = self.validation.iter().zip(validation).map(labelled);
         let frames = self.training.iter().chain(&self.validation);
         let mut differences = Vec::new();

@@ -8,6 +8,9 @@ use super::super::weight_gradient::WeightGradient;
 use super::super::{readout::SHIFTS, tape::TapeOperation};
 use super::knot_traces::KnotTraces;
 
+/// Numbers that a thread adds at a time.
+const PART: usize = 8192;
+
 /// The derivatives of a loss with respect to the matrices and tables of a model, summed over structures.
 #[derive(Clone, Debug)]
 pub struct WeightSums {
@@ -50,33 +53,65 @@ impl WeightSums {
         }
     }
 
-    /// Adds other sums of the same model.
-    pub fn add(&mut self, other: &Self) {
-        for (sum, x) in self.layers.iter_mut().zip(&other.layers) {
-            for (sum, x) in sum.steps.iter_mut().flatten().zip(x.steps.iter().flatten()) {
-                sum.add(x);
+    /// Sets all to the sums of others of the same model. Each number is summed in the order of `others`, so that threads change no bit.
+    pub fn set_to_sum(&mut self, others: &[&Self], threads: &Threads) {
+        self.combine(others, true, threads);
+    }
+
+    /// Adds others of the same model, as [`Self::set_to_sum`].
+    pub fn add_all(&mut self, others: &[&Self], threads: &Threads) {
+        self.combine(others, false, threads);
+    }
+
+    fn combine(&mut self, others: &[&Self], from_zero: bool, threads: &Threads) {
+        let others: Vec<_> = others.iter().map(|other| other.slices()).collect();
+        let parts = |(array, sums): (usize, _)| {
+            let parts = <[f64]>::chunks_mut(sums, PART).enumerate();
+            parts.map(move |(number, part)| (array, number * PART, part))
+        };
+        let mut tasks: Vec<_> = self.slices_mut().into_iter().enumerate().flat_map(parts).collect();
+        threads.for_each(&mut tasks, |(array, begin, sums)| {
+            if from_zero {
+                sums.fill(0.0);
             }
-            sum.block.add(&x.block);
-            sum.norm.iter_mut().zip(&x.norm).for_each(|(sum, x)| *sum += x);
-            for (sum, x) in sum.tables.iter_mut().zip(&x.tables).chain(sum.factors.iter_mut().zip(&x.factors))
-            {
-                sum.iter_mut().zip(x).for_each(|(sum, x)| sum.add(x));
+            for other in &others {
+                let x = &other[*array][*begin..][..sums.len()];
+                sums.iter_mut().zip(x).for_each(|(sum, x)| *sum += x);
             }
-        }
-        self.perceptron.iter_mut().zip(&other.perceptron).for_each(|(sum, x)| sum.add(x));
-        self.shifts.iter_mut().zip(&other.shifts).for_each(|(sum, x)| *sum += x);
+        });
     }
 
     /// Sets all sums to zero.
     pub fn clear(&mut self) {
-        for sums in &mut self.layers {
-            sums.steps.iter_mut().flatten().for_each(WeightGradient::clear);
-            sums.block.clear();
-            sums.norm.fill(0.0);
-            sums.tables.iter_mut().chain(&mut sums.factors).for_each(|row| row.fill(Double::ZERO));
+        self.slices_mut().into_iter().for_each(|sums| sums.fill(0.0));
+    }
+
+    /// All arrays, in a fixed order.
+    fn slices(&self) -> Vec<&[f64]> {
+        let Self { layers, perceptron, shifts } = self;
+        let mut all = Vec::new();
+        for LayerSums { steps, block, norm, tables, factors } in layers {
+            all.extend(steps.iter().flatten().chain([block]).map(WeightGradient::flat));
+            all.extend(tables.iter().chain(factors).map(|row| Double::flat(row)));
+            all.push(norm.as_slice());
         }
-        self.perceptron.iter_mut().for_each(WeightGradient::clear);
-        self.shifts.fill(0.0);
+        all.extend(perceptron.iter().map(WeightGradient::flat));
+        all.push(shifts.as_slice());
+        all
+    }
+
+    /// The same arrays in the same order.
+    fn slices_mut(&mut self) -> Vec<&mut [f64]> {
+        let Self { layers, perceptron, shifts } = self;
+        let mut all = Vec::new();
+        for LayerSums { steps, block, norm, tables, factors } in layers {
+            all.extend(steps.iter_mut().flatten().chain([block]).map(WeightGradient::flat_mut));
+            all.extend(tables.iter_mut().chain(factors).map(|row| Double::flat_mut(row)));
+            all.push(norm.as_mut_slice());
+        }
+        all.extend(perceptron.iter_mut().map(WeightGradient::flat_mut));
+        all.push(shifts.as_mut_slice());
+        all
     }
 
     /// Adds the derivatives with respect to the arrays of the file to `out`.
