@@ -15,6 +15,7 @@ use wire::ContentHash;
 
 use super::geometry::Geometry;
 use super::loader::Loader;
+use super::walk_plan::cell_bias_fault;
 use crate::all_cores;
 use crate::config::{ConfigError, OnInvalid, WalkSection, Warning, location};
 
@@ -225,7 +226,7 @@ impl Loader<'_> {
         if !self.config.walks.is_empty() {
             return Ok(());
         }
-        let WalkSection { volume_ramp, barostat, temperature, thermostat, .. } = &self.config.walk;
+        let WalkSection { volume_ramp, barostat, cell_bias, temperature, thermostat, .. } = &self.config.walk;
         if volume_ramp.is_some() && structure.periodic == [false; 3] {
             return Err(
                 "the structure has no periodic direction, and so no volume for walk.volume_ramp to change; give it a \
@@ -236,6 +237,9 @@ impl Loader<'_> {
         let fault = |barostat: &BarostatSettings| barostat.fault(temperature.get(), thermostat, structure);
         if let Some(fault) = barostat.as_ref().and_then(fault) {
             return Err(format!("walk.barostat: {fault}"));
+        }
+        if let Some(fault) = cell_bias.and_then(|_| cell_bias_fault(structure)) {
+            return Err(format!("walk.cell_bias: {fault}"));
         }
         Ok(())
     }

@@ -58,7 +58,7 @@ pub struct GuardSettings {
     pub max_temperature: f64,
     /// Whether a walk rolls back to a checkpoint after rejections; if not, it goes on.
     pub rollback: bool,
-    /// Consecutive rejections by the same guard after which the walk rolls back to a checkpoint.
+    /// Consecutive rejections, by any guard, after which the walk rolls back to a checkpoint.
     pub max_consecutive_rejections: u32,
     /// Number of roll backs after which the walk ends instead.
     pub max_rollbacks: u32,

@@ -83,8 +83,10 @@ fn a_reference_run_and_a_biased_cell_continue_from_any_step() {
     assert_eq!((&whole.outcome, whole.progress.step), (&Outcome::StepsDone, 90));
     let context =
         WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings.clone()) };
-    let mut next = from(conditions(1.02, true), 500);
-    // Interrupted twice in the reference run, which counts no steps of the walk.
+    // Interrupted twice in the reference run, of which an assignment makes as many steps as it would make of the walk.
+    let undisturbed = run(&settings, &from(conditions(1.02, true), 40));
+    assert_eq!((&undisturbed.outcome, undisturbed.progress.step), (&Outcome::StepsDone, 0));
+    let mut next = from(conditions(1.02, true), 40);
     for steps in [7, 31] {
         let asked = AtomicU64::new(0);
         let stopping = || asked.fetch_add(1, Ordering::Relaxed) == steps;
@@ -92,15 +94,16 @@ fn a_reference_run_and_a_biased_cell_continue_from_any_step() {
         assert_eq!((&report.outcome, report.progress.step), (&Outcome::Interrupted, 0));
         next.checkpoint = Some(report.checkpoint);
     }
-    // An assignment has as many steps of it as it would have of the walk.
-    next.last_step = 5;
     let report = run(&settings, &next);
     assert_eq!((&report.outcome, report.progress.step), (&Outcome::StepsDone, 0));
+    assert_eq!(report.checkpoint, undisturbed.checkpoint, "interruptions are no steps");
     next.checkpoint = Some(report.checkpoint);
-    for last_step in [20, 21, 33, 90] {
+    for last_step in [5, 20, 21, 33, 90] {
+        next.number += 1;
         next.last_step = last_step;
         let report = run(&settings, &next);
-        assert_eq!((&report.outcome, report.progress.step), (&Outcome::StepsDone, last_step));
+        let expected = if last_step == 5 { 0 } else { last_step };
+        assert_eq!((&report.outcome, report.progress.step), (&Outcome::StepsDone, expected));
         next.checkpoint = Some(report.checkpoint);
     }
     assert_eq!(next.checkpoint, Some(whole.checkpoint));

@@ -177,7 +177,15 @@ fn damaged_checkpoints_do_not_stop_a_walker() {
         let go = || advance(&context, &next, Arc::clone(&mixture), || false, |_| {}).unwrap();
         let report = catch_unwind(AssertUnwindSafe(go));
         let report = report.unwrap_or_else(|_| panic!("a panic at mutation {number}"));
-        refused += u32::from(matches!(report.outcome, Outcome::Ended(WalkEnd::InvalidStart { .. })));
+        let unreadable = |reason: &str| reason.contains("the walk's checkpoint cannot be read");
+        match &report.outcome {
+            Outcome::Ended(WalkEnd::Diverged { reason }) if unreadable(reason) => {
+                assert_eq!(Some(report.checkpoint), next.checkpoint);
+                refused += 1;
+            }
+            Outcome::Ended(WalkEnd::InvalidStart { reason }) => panic!("this is not its start: {reason}"),
+            _ => {}
+        }
     }
     assert!(refused > 0);
 }
@@ -301,6 +309,28 @@ fn the_skin_changes_nothing() {
     let lost = |outcome: &Outcome<Candidate>| matches!(outcome, Outcome::Ended(WalkEnd::Diverged { reason }) if reason.contains("no neighbour"));
     assert!(lost(&ends[0].0), "{:?}", ends[0]);
     assert!(ends.iter().all(|end| *end == ends[0]), "{ends:?}");
+}
+
+/// Of its collections, a walk remembers those that a roll back could still count from.
+#[test]
+fn the_checkpoint_does_not_grow_with_collections() {
+    let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 1e-9").unwrap();
+    let guard = GuardSettings { checkpoint_interval: 20, ..settings().guard };
+    let settings = WalkSettings { collection, min_interval: 1, trace_interval: 0, guard, ..settings() };
+    let context = WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings) };
+    let (mut next, mixture) = (first_of("vacancy", conditions()), mixture());
+    let mut sizes = Vec::new();
+    for _ in 0..200 {
+        let report = advance(&context, &next, Arc::clone(&mixture), || false, |_| {}).unwrap();
+        assert!(matches!(report.outcome, Outcome::Candidate(_)), "{:?}", report.outcome);
+        sizes.push(report.checkpoint.len());
+        next.checkpoint = Some(report.checkpoint);
+        next.verdict = Some(Verdict::Accepted);
+        next.last_step += 1000;
+    }
+    let largest = |sizes: &[usize]| *sizes.iter().max().unwrap();
+    // Steps are written in as few bytes as they need.
+    assert!(largest(&sizes[100..]) < largest(&sizes[..100]) + 60, "{sizes:?}");
 }
 
 #[test]
