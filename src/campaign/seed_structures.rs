@@ -244,6 +244,18 @@ impl Loader<'_> {
         Ok(())
     }
 
+    /// Checks that there is a cluster where there is a wall.
+    pub fn check_wall(&self, seeds: &SeedStructures) -> Result<(), ConfigError> {
+        let is_cluster = |seed: &SourcedStructure| seed.plan.structure.periodic == [false; 3];
+        if self.config.guard.wall.is_none() || seeds.valid.iter().any(is_cluster) {
+            return Ok(());
+        }
+        let key = "guard.wall".to_owned();
+        let message =
+            "a wall holds clusters together, and every seed structure is periodic; leave it out".to_owned();
+        Err(ConfigError::File { at: location(self.path, self.text, &key), key, message })
+    }
+
     /// Warns of skipped structures, and of likely mistakes: duplicate structures and distances that do not match the
     /// elements.
     pub fn suspicious_seed_structures(&self, seeds: &SeedStructures) -> Vec<Warning> {

@@ -2,7 +2,7 @@
 
 use atoms::MinDistanceRule;
 use md::BarostatSettings;
-use potentials::ZblWindows;
+use potentials::{WallSettings, ZblWindows};
 use serde::{Deserialize, Serialize};
 
 use crate::cell_bias::CellBiasSettings;
@@ -43,6 +43,8 @@ pub struct WalkSettings {
     pub min_interval_after_decline: u64,
     /// Windows of the switched ZBL repulsion; `None` without one.
     pub zbl: Option<ZblWindows>,
+    /// The wall around clusters; `None` without one.
+    pub wall: Option<WallSettings>,
     /// Guards.
     pub guard: GuardSettings,
 }

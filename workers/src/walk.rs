@@ -18,7 +18,7 @@ use atoms::ShortestDistances;
 use calm::{CollectionRule, Mixture};
 use md::{Dynamics, Stream};
 use potentials::grace::Threads;
-use potentials::{ModelWithFeatures, Zbl};
+use potentials::{ModelWithFeatures, Wall, Zbl};
 use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd, WalkProgress};
 use wire::{Candidate, Origin, TracePoint};
 
@@ -121,6 +121,8 @@ impl<'a> RunningWalk<'a> {
         let bias_averaging_steps = settings.bias_averaging_steps;
         let evaluator = Arc::clone(model).evaluator(threads.clone());
         let mut potential = BiasedPotential::new(evaluator, mixture, zbl, bias_averaging_steps, species)?;
+        let cluster = Some(&assignment.seed_structure).filter(|seed| seed.periodic == [false; 3]);
+        potential.wall = cluster.zip(settings.wall).map(|(cluster, wall)| Wall::around(cluster, &wall));
         let (dynamics, state) = match &assignment.checkpoint {
             None => start(settings, assignment, &mut potential)?,
             Some(bytes) => {

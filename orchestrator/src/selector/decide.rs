@@ -296,7 +296,9 @@ impl DecisionState {
         {
             Some(DeclineReason::Backlog)
         } else {
-            None
+            // The walker has tested the grade under its own mixture, which sinks with updates.
+            let is_too_large = |bound| maximum(&graded.original.gamma) > bound;
+            self.settings.max_grade.is_some_and(is_too_large).then_some(DeclineReason::GradeTooLarge)
         }
     }
 
