@@ -127,6 +127,37 @@ fn a_control_walk_is_the_unbiased_walk() {
     assert_ne!(walk(true), walk(false));
 }
 
+/// Without a bias, a walk is what the dynamics of the model give without any of the walk's code: bit for bit.
+#[test]
+fn a_control_walk_is_plain_dynamics_of_the_model() {
+    let settings =
+        WalkSettings { reference_steps: 0, zbl: None, cell_bias: quick(), ..at_constant_pressure() };
+    let found = frame(&settings, conditions(1.03, true), 150);
+    let model = model();
+    let mut grace = Grace::new(Arc::clone(&model));
+    let stream = Stream::new(settings.rng_seed, 0, 0);
+    let mut state = State::thermal(seed_structure("vacancy"), 600.0, &stream);
+    let volume = md::extent(&state.structure);
+    md::scale_volume(&mut state.structure, 1.03 * volume / volume);
+    let thermostat = settings.thermostat.start(600.0);
+    let run = DynamicsSettings {
+        time_step: 2.0,
+        thermostat: thermostat.clone(),
+        cell_motion: md::CellMotion::Fixed,
+        stream,
+        skin: settings.skin,
+    };
+    let mut dynamics = Dynamics::new(state, run, &mut grace).unwrap();
+    (0..settings.equilibration_steps).for_each(|_| dynamics.step(&mut grace).unwrap());
+    let barostat = settings.barostat.start(600.0, &thermostat, dynamics.structure());
+    dynamics.set_cell_motion(barostat.into()).unwrap();
+    (settings.equilibration_steps..150).for_each(|_| dynamics.step(&mut grace).unwrap());
+    assert!((dynamics.structure().cell.volume() / volume - 1.03).abs() > 1e-3, "the cell moves");
+    assert_eq!(found.structure, *dynamics.structure());
+    assert_eq!(found.forces, dynamics.evaluation().forces);
+    assert_eq!(found.temperature, dynamics.temperature());
+}
+
 /// The stress does work on the cell, which goes where grades are larger.
 #[test]
 fn the_bias_on_the_cell_works_along_the_derivative_of_the_grades() {
