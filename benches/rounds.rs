@@ -168,6 +168,7 @@ fn settings() -> SelectorSettings {
         control: false,
         control_share: 0.5,
         min_distances: MinDistanceRule::default(),
+        max_grade: None,
         declined_feature_bytes: 0,
         version: Default::default(),
         refit_at: None,
@@ -202,6 +203,7 @@ fn walk_settings() -> WalkSettings {
         min_interval: 200,
         min_interval_after_decline: 20,
         zbl: Some(ZblWindows::Uniform(ZblWindow { inner: 1.6, outer: 2.4 })),
+        wall: None,
         guard: GuardSettings {
             min_distances: MinDistanceRule::default(),
             max_grade: None,

@@ -105,6 +105,7 @@ impl LoadedCampaign {
         });
         let labels = loader.seed_structures(&*model.shared()).and_then(|mut seeds| {
             let protocol = loader.protocol(&mut seeds)?;
+            loader.check_wall(&seeds)?;
             warnings.extend(loader.plan_walks(&mut seeds)?);
             loader.check_update_target(&seeds.valid)?;
             Ok((seeds, protocol))
@@ -317,6 +318,7 @@ impl LoadedCampaign {
             min_interval: collect.min_interval,
             min_interval_after_decline: collect.min_interval_after_decline.get(),
             zbl: guard.zbl.clone(),
+            wall: guard.wall.map(|wall| wall.settings()),
             guard: GuardSettings {
                 min_distances: guard.min_distances.clone(),
                 max_grade: guard.max_grade.map(|grade| grade.get()),
@@ -394,6 +396,7 @@ pub fn selector_settings(config: &Config) -> SelectorSettings {
         control: campaign.control,
         control_share: campaign.control_share.get(),
         min_distances: guard.min_distances.clone(),
+        max_grade: config.guard.max_grade.map(|grade| grade.get()),
         declined_feature_bytes: collect.declined_features_mb * 1_000_000,
         version: PotentialVersion::default(),
         refit_at: None,

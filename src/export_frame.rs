@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use atoms::extxyz::{Column, ColumnData, ExtxyzValue, Frame, FrameLabels, LabelKeys};
+use atoms::fragments;
 use dft::RetryAdjustment;
 use store::records::Label;
 use store::{ExportRow, ExportSource};
@@ -31,6 +32,7 @@ pub fn facts<'a>(
         energy: Some(row.label.energy),
         max_force: Some(row.label.max_force()),
         retry_adjustments: Some(&row.label.details.retry_adjustments),
+        fragments: fragments(&row.structure).ok(),
         species: &row.structure.species,
         origin: "imported",
         ..StructureProperties::default()
@@ -64,8 +66,12 @@ pub fn frame(
     campaign: &str,
     conditions: &BTreeMap<WalkId, WalkConditions>,
 ) -> Frame {
+    let fragments = fragments(&row.structure).ok();
     let mut frame = Frame::from(row.structure);
     add_label(&mut frame, row.label, keys);
+    if let Some(fragments) = fragments {
+        frame.info.insert("fragments".to_owned(), integer(fragments as u64));
+    }
     let mut info = |key: &str, value: ExtxyzValue| frame.info.insert(key.to_owned(), value);
     info("campaign", campaign.into());
     info("protocol", row.protocol_name.into());

@@ -78,20 +78,21 @@ impl Summary {
     fn write_candidates(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let candidates = &self.status.candidates;
         let declined = &candidates.declined;
-        let unlikely = declined.unlikely_to_complete;
+        let seldom = [
+            ("unlikely to complete", declined.unlikely_to_complete),
+            ("grade too large", declined.grade_too_large),
+        ];
         let all = declined.covered
             + declined.duplicate
             + declined.too_close
             + declined.budget
             + declined.backlog
-            + unlikely;
-        let unlikely = match unlikely {
-            0 => String::new(),
-            unlikely => format!(", unlikely to complete {unlikely}"),
-        };
+            + seldom.iter().map(|(_, count)| count).sum::<u64>();
+        let there = seldom.iter().filter(|(_, count)| *count > 0);
+        let seldom: String = there.map(|(reason, count)| format!(", {reason} {count}")).collect();
         writeln!(
             f,
-            "candidates       {} seen, {} accepted, {all} declined (covered {}, duplicate {}, too close {}, budget {}, backlog {}{unlikely})",
+            "candidates       {} seen, {} accepted, {all} declined (covered {}, duplicate {}, too close {}, budget {}, backlog {}{seldom})",
             candidates.seen,
             candidates.accepted,
             declined.covered,

@@ -11,7 +11,7 @@ use atoms::units::{ACCELERATION, BOLTZMANN};
 use atoms::{Evaluation, NeighbourList, Potential, read_extxyz};
 use potentials::{Eam, EamStyle};
 
-use crate::common::{Running, config, deviation, program, refuse, succeed};
+use crate::common::{Running, calmwalk, config, deviation, program, refuse, stderr, succeed, write_frames};
 
 /// A configuration for `steps` steps of the first aluminium seed structure.
 fn configuration(steps: u64, rng_seed: u64, thermostat: &str) -> String {
@@ -121,6 +121,72 @@ fn the_configuration_in_configs_runs() {
     // The mean of 20 nearly independent frames: √(2/93/20) of 300 K is 10 K.
     let mean = frames[1..].iter().map(|frame| number(frame, "temperature")).sum::<f64>() / 20.0;
     assert!((mean - 300.0).abs() < 50.0, "{mean} K");
+}
+
+/// The cell relaxes from 3 % above the volume at which the potential has no pressure, and then follows the set pressure.
+#[test]
+fn a_barostat_moves_the_cell_to_its_pressure() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let mut seed = read_extxyz(&config("data/aluminium_seeds.extxyz")).unwrap().remove(0);
+    md::scale_volume(&mut seed.structure, 1.05);
+    write_frames(&here.join("start.extxyz"), &[seed]);
+    let mean_volume = |pressure: f64| {
+        let thermostat = format!(
+            "{{ nose_hoover = {{ relaxation_time = 100 }} }}\nbarostat = {{ pressure = {pressure}, relaxation_time = 200.0 }}"
+        );
+        let text = configuration(3000, 1, &thermostat)
+            .replace(&format!("{:?}", config("data/aluminium_seeds.extxyz")), "\"start.extxyz\"");
+        fs::write(here.join("md.toml"), text).unwrap();
+        let output = calmwalk(here, ["md", "md.toml"]);
+        assert!(output.status.success(), "{}", stderr(&output));
+        let printed = stderr(&output);
+        assert!(printed.contains("pressure (GPa)") && printed.contains("volume/first"), "{printed}");
+        let frames = read_extxyz(&here.join("out.extxyz")).unwrap();
+        let volumes: Vec<f64> =
+            frames.iter().map(|frame| frame.structure.cell.volume() / frame.structure.len() as f64).collect();
+        let (first, last) = (volumes[0], &volumes[50..]);
+        let mean = last.iter().sum::<f64>() / last.len() as f64;
+        let rows = printed.lines().filter(|line| line.trim_start().starts_with("3000 "));
+        let ratio: f64 = rows.last().unwrap().split_whitespace().last().unwrap().parse().unwrap();
+        assert!((ratio - volumes.last().unwrap() / first).abs() < 1e-4, "{printed}");
+        mean
+    };
+    // 4.0738 Å at 300 K and 1 bar (docs/dynamics.md); fluctuations of the volume are 1 %, of which 20 are nearly independent.
+    let relaxed = mean_volume(1.0);
+    assert!((relaxed / (4.0738_f64.powi(3) / 4.0) - 1.0).abs() < 0.01, "{relaxed} Å³");
+    // With a bulk modulus of 80 GPa that grows by about 5 GPa for each GPa.
+    let pressed = mean_volume(40_000.0);
+    assert!((0.945..0.967).contains(&(pressed / relaxed)), "{pressed} Å³, {relaxed} Å³");
+}
+
+#[test]
+fn impossible_barostats_are_refused_at_their_key() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let refused = |barostat: &str| {
+        let thermostat = format!("{{ langevin = {{ friction = 0.01 }} }}\nbarostat = {barostat}");
+        fs::write(here.join("md.toml"), configuration(10, 1, &thermostat)).unwrap();
+        refuse(here, ["md", "md.toml"])
+    };
+    for (barostat, expected) in [
+        ("{ relaxation_time = 0.0 }", "dynamics.barostat.relaxation_time is 0"),
+        ("{ pressure = nan }", "dynamics.barostat.pressure"),
+        ("{ pressure = 1e9 }", "1 GPa is 10000 bar"),
+        ("{ presure = 1.0 }", "presure"),
+    ] {
+        let said = refused(barostat);
+        assert!(said.contains(expected) && said.contains("md.toml:"), "{barostat}: {said}");
+    }
+    // A cluster has no cell that could move.
+    let mut cluster = read_extxyz(&config("data/aluminium_seeds.extxyz")).unwrap().remove(0);
+    cluster.structure.periodic = [false; 3];
+    write_frames(&here.join("cluster.extxyz"), &[cluster]);
+    let text = configuration(10, 1, "{ none = {} }\nbarostat = {}")
+        .replace(&format!("{:?}", config("data/aluminium_seeds.extxyz")), "\"cluster.extxyz\"");
+    fs::write(here.join("md.toml"), text).unwrap();
+    let said = refuse(here, ["md", "md.toml"]);
+    assert!(said.contains("dynamics.barostat: a cluster has no periodic direction"), "{said}");
 }
 
 #[test]

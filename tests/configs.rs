@@ -263,10 +263,9 @@ fn foundation_campaign(name: &str, walks: usize) -> String {
 }
 
 /// With walks of 300 instead of 100,000 biased steps.
-#[test]
-fn driven_walks_in_aluminium_run() {
+fn driven_walks(name: &str, version_of_each: bool) {
     let directory = tempfile::tempdir().unwrap();
-    let mut text = demo("al-collect.toml");
+    let mut text = demo(name);
     for [key, whole, short] in [
         ["biased_steps", "100000", "300"],
         ["reference_steps", "5000", "60"],
@@ -284,21 +283,64 @@ fn driven_walks_in_aluminium_run() {
     let volumes: Vec<_> = walks.iter().map(|walk| walk["relative_volume"].as_f64().unwrap()).collect();
     assert!(walks.iter().all(|walk| walk["state"] == "completed" && walk["step"] == 340), "{status}");
     assert!(volumes.iter().all(|volume| (0.75..=1.3).contains(volume)), "{volumes:?}");
-    assert_eq!(volumes.len(), 4);
+    let starts: Vec<_> =
+        walks.iter().map(|walk| walk["conditions"]["constant_pressure"]["start_volume"].as_f64()).collect();
+    assert_eq!(starts, [0.94, 0.97, 1.03, 1.06].map(Some));
+    // With a mixture of its own, each walk begins with that of the potential.
+    let seeds: BTreeSet<_> = walks.iter().map(|walk| walk["seed_structure"].to_string()).collect();
+    assert_eq!(seeds.len(), if version_of_each { 4 } else { 1 });
+}
+
+#[test]
+fn driven_walks_in_aluminium_run() {
+    driven_walks("al-collect.toml", true);
+    driven_walks("al-collect-shared.toml", false);
+}
+
+#[test]
+fn driven_walks_in_silicon_run() {
+    driven_walks("si-collect.toml", true);
+}
+
+/// With 400 instead of 22,000 steps.
+#[test]
+fn the_unbiased_collections_run() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    for (element, atoms) in [("al", 108), ("si", 128)] {
+        for temperature in [300, 500] {
+            let name = format!("md-{element}-{temperature}");
+            let text = demo(&format!("{name}.toml"));
+            assert!(text.contains("\nsteps = 22000 ") && text.contains("\nbarostat = { pressure = 1.0 }\n"));
+            fs::write(here.join("md.toml"), text.replace("\nsteps = 22000 ", "\nsteps = 400 ")).unwrap();
+            succeed(here, ["md", "md.toml"]);
+            let frames = read_extxyz(&here.join(format!("{name}.extxyz"))).unwrap();
+            let volumes: Vec<_> = frames.iter().map(|frame| frame.structure.cell.volume()).collect();
+            assert_eq!((frames.len(), frames[0].structure.len()), (3, atoms));
+            assert!(volumes[1] != volumes[0], "{volumes:?}");
+            assert!(frames.iter().all(|frame| frame.labels().unwrap().stress.is_some()));
+        }
+    }
 }
 
 #[test]
 fn every_file_of_configs_is_run_by_a_test() {
     // `cargo test --test external dft::` runs silicon-dft.toml, and `batch_systems` campaigns with lsf.toml and pbs.toml.
     let run = [
+        "al-collect-shared.toml",
         "al-collect.toml",
         "aluminium.toml",
         "foundation-campaign.toml",
         "foundation-expansion.toml",
         "lsf.toml",
+        "md-al-300.toml",
+        "md-al-500.toml",
         "md-aluminium.toml",
+        "md-si-300.toml",
+        "md-si-500.toml",
         "nickel-aluminium-hydrogen.toml",
         "pbs.toml",
+        "si-collect.toml",
         "silicon-dft.toml",
         "silicon.toml",
     ];

@@ -2,11 +2,14 @@
 
 use std::fs;
 use std::path::Path;
+use std::process::Stdio;
+use std::time::Duration;
 
 use serde_json::{Value, json};
 
 use crate::common::campaign::{Outcome, Small, outcome};
-use crate::common::{calmwalk, stderr, succeed};
+use crate::common::processes::signal;
+use crate::common::{Running, calmwalk, program, refuse, stderr, succeed, write_frames};
 
 /// Two volumes at the start with a biased cell, and one walk under pressure without.
 const GROUPS: &str = r#"
@@ -33,6 +36,94 @@ fn write(here: &Path, walkers: usize, keys: &str, groups: &str) {
     let ramp = "volume_ramp = { from = 1.0, to = 1.25 }\n";
     assert!(text.contains(ramp));
     fs::write(config, text.replace(ramp, keys) + groups).unwrap();
+}
+
+/// A pressure that tears the cell apart ends its walks with the reason, and the campaign goes on to its end.
+#[test]
+fn a_campaign_outlives_walks_whose_cells_are_torn_apart() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let groups =
+        "[[walks]]\nname = \"torn\"\npressures = [-1e6]\n[[walks]]\nname = \"whole\"\npressures = [1.0]\n";
+    write(here, 2, "reference_steps = 0\n", groups);
+    succeed(here, ["run", "campaign.toml"]);
+    let status: Value = serde_json::from_str(&succeed(here, ["status", "campaign", "--json"])).unwrap();
+    assert_eq!(status["finished"], true);
+    let walks = status["walks"].as_array().unwrap();
+    let biased = || walks.iter().filter(|walk| walk["origin"] == "biased");
+    assert_eq!(biased().count(), 4);
+    for walk in biased() {
+        let is_torn = walk["conditions"]["group"] == "torn";
+        let reason = walk["reason"].as_str().unwrap();
+        assert_eq!(walk["state"] == "diverged", is_torn, "{walk}");
+        if is_torn {
+            assert!(reason.contains("the volume is") || reason.contains("the cell changes by"), "{walk}");
+        }
+    }
+}
+
+/// A slab without a third lattice vector has no volume on which the bias could act.
+#[test]
+fn a_biased_cell_needs_a_volume() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let barostat = "barostat = {}\ncell_bias = { stress_scale = 76.0 }\n";
+    for (keys, groups, expected) in [
+        (barostat, "", "walk.cell_bias: the lattice vectors do not span space"),
+        (
+            "barostat = {}\n",
+            "[[walks]]\nname = \"a\"\ncell_bias = true\n",
+            "group 'a' has a bias on the cell: the lattice vectors do not span space",
+        ),
+    ] {
+        write(here, 1, keys, groups);
+        let mut frame = atoms::read_extxyz(&here.join("seeds.extxyz")).unwrap().remove(0);
+        frame.structure.periodic = [true, true, false];
+        frame.structure.cell.0[2] = [0.0; 3];
+        write_frames(&here.join("seeds.extxyz"), &[frame]);
+        let said = refuse(here, ["validate", "campaign.toml"]);
+        assert!(said.contains(expected), "{said}");
+    }
+    // Without a bias, its periodic directions may move.
+    let config = fs::read_to_string(here.join("campaign.toml")).unwrap();
+    fs::write(here.join("campaign.toml"), config.replace("cell_bias = true", "cell_bias = false")).unwrap();
+    succeed(here, ["validate", "campaign.toml"]);
+}
+
+/// Interruptions in a reference run, also within an assignment, are no steps of it: a walk would begin a round earlier.
+#[test]
+fn interruptions_of_reference_runs_change_nothing() {
+    let written = || {
+        let directory = tempfile::tempdir().unwrap();
+        write(directory.path(), 1, &KEYS.replace("= 40", "= 1500"), GROUPS);
+        let config = directory.path().join("campaign.toml");
+        let text = fs::read_to_string(&config).unwrap();
+        assert!(text.contains("steps_per_assignment = 40\n"));
+        fs::write(&config, text.replace("steps_per_assignment = 40\n", "steps_per_assignment = 200\n"))
+            .unwrap();
+        directory
+    };
+    let (alone, disturbed) = (written(), written());
+    succeed(alone.path(), ["run", "campaign.toml"]);
+    let expected = outcome(&alone.path().join("campaign"));
+    let here = disturbed.path();
+    let mut interruptions = 0;
+    loop {
+        let mut command = program(here);
+        let command = command.args(["run", "campaign.toml"]).stdout(Stdio::null()).stderr(Stdio::null());
+        let mut running = Running(command.spawn().unwrap());
+        if interruptions < 6 {
+            std::thread::sleep(Duration::from_millis(500 + 130 * interruptions));
+            signal(running.0.id(), "INT");
+            interruptions += 1;
+        }
+        match running.0.wait().unwrap().code() {
+            Some(0) => break,
+            code => assert!(matches!(code, Some(130) | None), "{code:?}"),
+        }
+    }
+    assert_eq!(interruptions, 6, "the campaign ended before it was interrupted often enough");
+    assert_eq!(outcome(&here.join("campaign")), expected);
 }
 
 fn run(walkers: usize) -> (tempfile::TempDir, Outcome) {

@@ -38,6 +38,70 @@ fn largest(frame: &Frame, key: &str) -> f64 {
 }
 
 #[test]
+fn some_structures_of_each_walk_are_drawn() {
+    let directory = campaign();
+    let here = directory.path();
+    let of_walks = |frames: &[Frame]| {
+        let mut walks: BTreeMap<i64, Vec<String>> = BTreeMap::new();
+        for frame in frames {
+            let walk = frame.info["walk"].number().unwrap() as i64;
+            walks.entry(walk).or_default().push(text(frame, "candidate_id").to_owned());
+        }
+        walks
+    };
+    let all = of_walks(&export(here, &["--control"]));
+    assert!(all.values().filter(|found| found.len() > 2).count() > 1, "{all:?}");
+    let draw = |number: &str, seed: &str| {
+        of_walks(&export(here, &["--control", "--per-walk", number, "--draw-rng-seed", seed]))
+    };
+    let two = draw("2", "0");
+    for (walk, drawn) in &two {
+        let of_walk = &all[walk];
+        assert_eq!(drawn.len(), of_walk.len().min(2));
+        let places = drawn.iter().map(|id| of_walk.iter().position(|other| other == id).unwrap());
+        assert!(places.is_sorted(), "in the order of the decisions");
+    }
+    assert_eq!(two.len(), all.len());
+    assert_eq!(two, draw("2", "0"));
+    assert!((1..5).any(|seed| draw("2", &seed.to_string()) != two), "other random seeds draw others");
+    let three = draw("3", "0");
+    assert!(two.iter().all(|(walk, drawn)| drawn.iter().all(|id| three[walk].contains(id))));
+    assert_eq!(draw("1000", "0"), all);
+    // The draw is from what matches the filter.
+    let late = "step > 100";
+    let matching = of_walks(&export(here, &["--where", late]));
+    let printed =
+        succeed(here, ["export", "here", "--output", "out.extxyz", "--where", late, "--per-walk", "1"]);
+    let drawn = of_walks(&read_extxyz(&here.join("out.extxyz")).unwrap());
+    assert_eq!(drawn.keys().collect::<Vec<_>>(), matching.keys().collect::<Vec<_>>());
+    for (walk, of_walk) in &matching {
+        assert!(drawn[walk].len() == 1 && of_walk.contains(&drawn[walk][0]));
+        let plural = if of_walk.len() == 1 { "" } else { "s" };
+        let line = format!("drawn: 1 of {} structure{plural} of walk {walk}\n", of_walk.len());
+        assert!(printed.contains(&line), "{printed}");
+    }
+}
+
+/// Connected atoms are one fragment, as is every frame of a dense crystal.
+#[test]
+fn frames_have_their_number_of_fragments() {
+    let directory = campaign();
+    let here = directory.path();
+    let all = export(here, &[]);
+    let number = |frame: &Frame| frame.info["fragments"].number().unwrap();
+    for frame in &all {
+        assert_eq!(number(frame), atoms::fragments(&frame.structure).unwrap() as f64);
+    }
+    let one = all.iter().filter(|frame| number(frame) == 1.0).count();
+    assert!(one > 0);
+    assert_eq!(export(here, &["--where", "fragments = 1"]).len(), one);
+    let explained = succeed(here, ["explain", "here", text(&all[0], "candidate_id")]);
+    let fragments = number(&all[0]);
+    let plural = if fragments == 1.0 { "" } else { "s" };
+    assert!(explained.contains(&format!(", {fragments} fragment{plural}; content")), "{explained}");
+}
+
+#[test]
 fn conditions_choose_what_they_say() {
     let directory = campaign();
     let here = directory.path();

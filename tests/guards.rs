@@ -207,3 +207,17 @@ fn a_campaign_has_a_bill_before_it_begins() {
     let like = json(here, ["estimate", "campaign.toml", "--cost-from", "less"]);
     assert!(hours(&like) > 0.0 && hours(&like) < 1.0, "{like}");
 }
+
+#[test]
+fn a_wall_needs_a_cluster() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let text = Small::default().text().replace("[guard]\n", "[guard]\nwall = {}\n");
+    assert!(text.contains("wall"));
+    fs::write(Small::default().write(here), &text).unwrap();
+    let said = refuse(here, ["validate", "campaign.toml"]);
+    assert!(said.contains("guard.wall") && said.contains("every seed structure is periodic"), "{said}");
+    fs::write(here.join("campaign.toml"), text.replace("wall = {}", "wall = { margin = 0.0 }")).unwrap();
+    let said = refuse(here, ["validate", "campaign.toml"]);
+    assert!(said.contains("guard.wall.margin is 0"), "{said}");
+}

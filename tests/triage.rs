@@ -43,6 +43,31 @@ fn rows(path: &Path) -> BTreeMap<String, BTreeMap<String, String>> {
     lines.map(row).collect()
 }
 
+/// Simple cubic aluminium that is far too dilute: its energy has a negative curvature.
+#[test]
+fn cells_that_no_bias_can_drive_are_found_before_the_walks() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write(here, &cubic("dilute", 3, 3.6, 0.0));
+    let config = here.join("campaign.toml");
+    let text = fs::read_to_string(&config).unwrap();
+    let ramp = "volume_ramp = { from = 1.0, to = 1.25 }\n";
+    assert!(text.contains(ramp));
+    let with = |cell_bias: &str| {
+        let keys = format!("barostat = {{}}\ncell_bias = {{ {cell_bias} }}\n");
+        fs::write(&config, text.replace(ramp, &keys)).unwrap();
+        let shown = succeed(here, ["validate", "campaign.toml", "--csv", "seeds.csv"]);
+        (shown, rows(&here.join("seeds.csv")))
+    };
+    let (shown, rows) = with("");
+    assert_eq!(rows["dilute"]["state"], "unstable_cell", "{rows:?}");
+    assert!(rows["dilute"]["remark"].contains("GPa): give walk.cell_bias.stress_scale"), "{rows:?}");
+    assert!(shown.contains("1 of 3 seed structures have no positive bulk modulus"), "{shown}");
+    assert_ne!(rows["vacancy"]["state"], "unstable_cell");
+    let (_, rows) = with("stress_scale = 76.0");
+    assert_ne!(rows["dilute"]["state"], "unstable_cell");
+}
+
 #[test]
 fn seed_structures_are_graded_and_measured() {
     let directory = tempfile::tempdir().unwrap();

@@ -592,6 +592,19 @@ fn candidates_whose_labels_would_probably_fail_are_declined() {
     assert_eq!(kinds(&next_candidate(&mut selector, 10, 5, far)), ["accepted"]);
 }
 
+/// The walker tests the grade under its own mixture, which sinks with updates; that under the original one does not.
+#[test]
+fn candidates_beyond_the_largest_grade_under_the_original_mixture_are_declined() {
+    let mut selector = begin(&SelectorSettings { max_per_walk: 9, max_grade: Some(4.0), ..live() }, 1);
+    assert_eq!(kinds(&next_candidate(&mut selector, 5, 1, [0.0, 3.0, 0.0])), ["accepted"]);
+    let commit = next_candidate(&mut selector, 6, 2, [0.0, 4.5, 0.0]);
+    assert_eq!(kinds(&commit), ["declined grade_too_large"]);
+    let detail = &commit.decisions[0].detail;
+    let grade = |mixture: &str| detail[mixture]["gamma_max"].as_f64().unwrap();
+    assert!(grade("selector") < 4.0 && grade("original") > 4.0, "{detail}");
+    assert_eq!((commit.components.len(), commit.walks[0].accepted), (0, 1));
+}
+
 /// The rule of updates is used in the search, not only the collection rule.
 #[test]
 fn the_update_target_comes_from_the_settings() {

@@ -270,6 +270,24 @@ fn every_end_is_logged_with_its_reason() {
     assert!(selector.is_done());
 }
 
+/// A walk that cannot go on from its checkpoint reports no progress: it keeps what it had.
+#[test]
+fn a_walk_that_cannot_go_on_keeps_its_step() {
+    let mut selector = begin(&settings(CampaignMode::Live), 1);
+    let assignment = next_assignment(&mut selector);
+    let progress = WalkProgress { step: 10, ..WalkProgress::default() };
+    decided(&mut selector, common::report(&assignment, Outcome::StepsDone, progress.clone()));
+    let assignment = next_assignment(&mut selector);
+    let diverged = Outcome::Ended(WalkEnd::Diverged { reason: "unreadable".into() });
+    let report = AssignmentReport {
+        checkpoint: assignment.checkpoint.clone().unwrap(),
+        ..common::report(&assignment, diverged, WalkProgress::default())
+    };
+    let commit = decided(&mut selector, report);
+    assert_eq!(commit.walks[0].progress, progress);
+    assert_eq!(commit.decisions[0].detail["step"], 10);
+}
+
 /// With control walks: collects at these steps, and then ends the biased walk.
 fn with_control(store: &mut MemoryStore, steps: &[u64]) -> Selector {
     let controlled = SelectorSettings {

@@ -13,6 +13,11 @@ from .store_errors import MissingPackage
 # Retry adjustments that depend on the machine and change no label (crates/dft/src/retry_adjustment.rs).
 _OF_RESOURCES = {"more_memory", "more_time", "other_node"}
 
+# Two atoms are bonded within this multiple of the sum of their covalent radii (crates/atoms/src/fragments.rs).
+_BOND_FACTOR = 1.25
+# Elements beyond have its radius.
+_CURIUM = 96
+
 
 def structure_atoms(structure: Structure) -> Any:
     """The structure as :class:`ase.Atoms`."""
@@ -25,6 +30,31 @@ def structure_atoms(structure: Structure) -> Any:
     )
 
 
+def count_fragments(atoms: Any) -> int:
+    """Number of sets of atoms that are joined by bonds."""
+    from ase.data import covalent_radii
+    from ase.neighborlist import neighbor_list
+
+    radii = covalent_radii[np.minimum(atoms.numbers, _CURIUM)]
+    first, second = neighbor_list("ij", atoms, _BOND_FACTOR * radii)
+    bonded: list[list[int]] = [[] for _ in range(len(atoms))]
+    for one, other in zip(first, second, strict=True):
+        bonded[one].append(int(other))
+    seen: set[int] = set()
+    fragments = 0
+    for start in range(len(atoms)):
+        if start in seen:
+            continue
+        fragments += 1
+        seen.add(start)
+        waiting = [start]
+        while waiting:
+            new = {other for other in bonded[waiting.pop()] if other not in seen}
+            seen |= new
+            waiting.extend(new)
+    return fragments
+
+
 def candidate_atoms(candidate: Candidate, campaign: str, has_versions: bool) -> Any:
     """A candidate; its label, if it has one, is the result of the frame's calculator.
 
@@ -32,7 +62,7 @@ def candidate_atoms(candidate: Candidate, campaign: str, has_versions: bool) -> 
     (eV/Å). ``gamma`` and ``gamma_nbr`` are those of the original mixture.
     """
     atoms = structure_atoms(candidate.structure)
-    info: dict[str, Any] = {"campaign": campaign}
+    info: dict[str, Any] = {"campaign": campaign, "fragments": count_fragments(atoms)}
     if candidate.label:
         _add_label(atoms, candidate.label, info)
     info |= {"candidate_id": candidate.id, "seed_structure": candidate.seed_structure_name}
@@ -66,7 +96,7 @@ def candidate_atoms(candidate: Candidate, campaign: str, has_versions: bool) -> 
 def imported_atoms(imported: Imported, campaign: str) -> Any:
     """An imported structure."""
     atoms = structure_atoms(imported.structure)
-    info: dict[str, Any] = {"campaign": campaign}
+    info: dict[str, Any] = {"campaign": campaign, "fragments": count_fragments(atoms)}
     if imported.label:
         _add_label(atoms, imported.label, info)
     info |= {"origin": "imported", "source_file": imported.file, "source_frame": imported.frame}

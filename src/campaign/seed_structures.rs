@@ -15,6 +15,7 @@ use wire::ContentHash;
 
 use super::geometry::Geometry;
 use super::loader::Loader;
+use super::walk_plan::cell_bias_fault;
 use crate::all_cores;
 use crate::config::{ConfigError, OnInvalid, WalkSection, Warning, location};
 
@@ -225,7 +226,7 @@ impl Loader<'_> {
         if !self.config.walks.is_empty() {
             return Ok(());
         }
-        let WalkSection { volume_ramp, barostat, temperature, thermostat, .. } = &self.config.walk;
+        let WalkSection { volume_ramp, barostat, cell_bias, temperature, thermostat, .. } = &self.config.walk;
         if volume_ramp.is_some() && structure.periodic == [false; 3] {
             return Err(
                 "the structure has no periodic direction, and so no volume for walk.volume_ramp to change; give it a \
@@ -237,7 +238,22 @@ impl Loader<'_> {
         if let Some(fault) = barostat.as_ref().and_then(fault) {
             return Err(format!("walk.barostat: {fault}"));
         }
+        if let Some(fault) = cell_bias.and_then(|_| cell_bias_fault(structure)) {
+            return Err(format!("walk.cell_bias: {fault}"));
+        }
         Ok(())
+    }
+
+    /// Checks that there is a cluster where there is a wall.
+    pub fn check_wall(&self, seeds: &SeedStructures) -> Result<(), ConfigError> {
+        let is_cluster = |seed: &SourcedStructure| seed.plan.structure.periodic == [false; 3];
+        if self.config.guard.wall.is_none() || seeds.valid.iter().any(is_cluster) {
+            return Ok(());
+        }
+        let key = "guard.wall".to_owned();
+        let message =
+            "a wall holds clusters together, and every seed structure is periodic; leave it out".to_owned();
+        Err(ConfigError::File { at: location(self.path, self.text, &key), key, message })
     }
 
     /// Warns of skipped structures, and of likely mistakes: duplicate structures and distances that do not match the

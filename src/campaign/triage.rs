@@ -1,12 +1,16 @@
 //! What there is to know about each seed structure before its walks start.
 
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
+use atoms::units::GPA_PER_EV_A3;
 use atoms::{ElementPair, NeighbourList, Species, Structure};
 use calm::rules::count_above;
 use calm::{Grades, Mixture};
-use potentials::PotentialWithFeatures;
 use potentials::grace::Threads;
+use potentials::{PotentialWithFeatures, Zbl};
+use wire::WalkConditions;
+use workers::bias::BiasedPotential;
 
 use super::{LoadedCampaign, SourcedStructure};
 use crate::all_cores;
@@ -18,6 +22,8 @@ pub enum Remark {
     Ungraded(String),
     /// The mixture has no data of these elements.
     NotInMixture(BTreeSet<Species>),
+    /// Walks with a bias on the cell cannot start from it without `walk.cell_bias.stress_scale`, and why.
+    UnstableCell(String),
     /// It meets the collection rule before its walks start.
     Candidate,
     /// Nothing.
@@ -90,8 +96,11 @@ impl<'a> Examiner<'a> {
         let remark = match &graded {
             Err(error) => Remark::Ungraded(error.clone()),
             Ok(()) if !missing.is_empty() => Remark::NotInMixture(missing),
-            Ok(()) if rule.is_met(gamma) => Remark::Candidate,
-            Ok(()) => Remark::Nothing,
+            Ok(()) => match self.unstable_cell(seed_structure) {
+                Some(reason) => Remark::UnstableCell(reason),
+                None if rule.is_met(gamma) => Remark::Candidate,
+                None => Remark::Nothing,
+            },
         };
         SeedStructureTriage {
             seed_structure,
@@ -100,6 +109,27 @@ impl<'a> Examiner<'a> {
             atoms_above: if graded.is_ok() { count_above(gamma, rule.threshold()) } else { 0 },
             needed_atoms: rule.needed_atoms(structure.len()),
             remark,
+        }
+    }
+
+    /// Why walks with a bias on the cell cannot start: there is no stress scale, and the bulk modulus in its place is not positive.
+    fn unstable_cell(&self, SourcedStructure { plan, .. }: &SourcedStructure) -> Option<String> {
+        let settings = self.campaign.walk_settings();
+        let is_biased =
+            |walk: &WalkConditions| walk.constant_pressure.is_some_and(|constant| constant.cell_bias);
+        if settings.cell_bias.stress_scale.is_some() || !plan.walks.iter().any(is_biased) {
+            return None;
+        }
+        // The potential of the walks, the bias off.
+        let species = &plan.structure.species;
+        let zbl = settings.zbl.as_ref().map(|windows| Zbl::new(species, windows)).transpose().ok()?;
+        let evaluator = self.campaign.model.shared().evaluator(Threads::default());
+        let mixture = Arc::new(self.campaign.artifact.mixture.clone());
+        let mut potential = BiasedPotential::new(evaluator, mixture, zbl, 1, species).ok()?;
+        match md::bulk_modulus(&plan.structure, &mut potential) {
+            Ok(modulus) if modulus > 0.0 => None,
+            Ok(modulus) => Some(format!("its bulk modulus is {:.1} GPa", modulus * GPA_PER_EV_A3)),
+            Err(error) => Some(error.to_string()),
         }
     }
 

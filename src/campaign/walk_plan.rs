@@ -183,10 +183,19 @@ fn cell_fault(walk: &WalkSection, conditions: &WalkConditions, structure: &Struc
     if structure.periodic == [false; 3] && conditions.changes_volume() {
         return Some("changes the volume, but the structure has no periodic direction".to_owned());
     }
-    let pressure = conditions.constant_pressure?.pressure;
-    let barostat = BarostatSettings { pressure, ..walk.barostat.unwrap_or_default() };
-    let fault = barostat.fault(conditions.temperature, &walk.thermostat, structure)?;
-    Some(format!("has a barostat: {fault}"))
+    let constant = conditions.constant_pressure?;
+    let barostat = BarostatSettings { pressure: constant.pressure, ..walk.barostat.unwrap_or_default() };
+    if let Some(fault) = barostat.fault(conditions.temperature, &walk.thermostat, structure) {
+        return Some(format!("has a barostat: {fault}"));
+    }
+    let fault = cell_bias_fault(structure).filter(|_| constant.cell_bias)?;
+    Some(format!("has a bias on the cell: {fault}"))
+}
+
+/// Why the cell of a structure cannot have a bias, which is a stress, if it cannot.
+pub(super) fn cell_bias_fault(structure: &Structure) -> Option<&'static str> {
+    let fault = "the lattice vectors do not span space, so the cell has no volume on which a stress could act: give it a third vector";
+    (structure.cell.volume() == 0.0).then_some(fault)
 }
 
 /// A volume ramp, or a constant pressure, or neither.

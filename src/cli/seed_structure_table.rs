@@ -74,6 +74,10 @@ impl<'a> SeedStructureTable<'a> {
             |is: fn(&Remark) -> bool| self.seed_structures.iter().filter(|found| is(&found.remark)).count();
         let remarks = [
             (
+                number(|remark| matches!(remark, Remark::UnstableCell(_))),
+                "have no positive bulk modulus for the bias on their cells",
+            ),
+            (
                 number(|remark| *remark == Remark::Candidate),
                 "meet the collection rule before their walks start",
             ),
@@ -175,6 +179,9 @@ fn words(remark: &Remark) -> String {
             let elements: Vec<_> = elements.iter().map(|species| species.symbol()).collect();
             format!("the mixture has no data of {}", elements.join(", "))
         }
+        Remark::UnstableCell(reason) => {
+            format!("walks with a bias on the cell cannot start ({reason}): give walk.cell_bias.stress_scale")
+        }
         Remark::Candidate => "a candidate before its walk starts".to_owned(),
         Remark::Nothing => String::new(),
     }
@@ -185,6 +192,7 @@ fn state(remark: &Remark) -> &'static str {
     match remark {
         Remark::Ungraded(_) => "ungraded",
         Remark::NotInMixture(_) => "not_in_mixture",
+        Remark::UnstableCell(_) => "unstable_cell",
         Remark::Candidate => "candidate",
         Remark::Nothing => "ready",
     }

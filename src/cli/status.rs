@@ -221,6 +221,9 @@ fn write_candidates(
     if declined.unlikely_to_complete > 0 {
         reasons.push(("unlikely to complete", declined.unlikely_to_complete));
     }
+    if declined.grade_too_large > 0 {
+        reasons.push(("grade too large", declined.grade_too_large));
+    }
     let all: u64 = reasons.iter().map(|(_, count)| count).sum();
     let reasons = reasons.iter().map(|(reason, count)| format!("{count} {reason}"));
     let reasons = reasons.collect::<Vec<_>>().join(", ");

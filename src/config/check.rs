@@ -7,7 +7,7 @@ use std::collections::HashSet;
 
 use atoms::MinDistanceRule;
 use calm::rules::Positive;
-use md::{ThermostatSettings, WrongSetting};
+use md::{BarostatSettings, ThermostatSettings, WrongSetting};
 use orchestrator::selector::{CampaignMode, UpdateProtocol};
 use potentials::{RadiiWindows, ZblWindow, ZblWindows};
 use store::ServerUrl;
@@ -264,6 +264,12 @@ fn check_thermostat(config: &Config) -> Result<(), InvalidValue> {
 pub fn wrong_thermostat(thermostat: &ThermostatSettings, section: &str) -> Option<InvalidValue> {
     let WrongSetting { key, found, expected } = thermostat.wrong()?;
     Some((format!("{section}.thermostat.{key}"), found.to_string(), expected.to_owned()))
+}
+
+/// The first impossible setting of a barostat in the table `section`.
+pub fn wrong_barostat(barostat: &BarostatSettings, section: &str) -> Option<InvalidValue> {
+    let WrongSetting { key, found, expected } = barostat.wrong()?;
+    Some((format!("{section}.barostat.{key}"), found.to_string(), expected.to_owned()))
 }
 
 fn check_min_distances(config: &Config) -> Result<(), InvalidValue> {

@@ -36,7 +36,7 @@ use toml::Spanned;
 use workers::labeller::LabelGuard;
 
 pub use changes::{ConfigChange, Refused, changed_keys, compare, without_changeable};
-pub use check::wrong_thermostat;
+pub use check::{wrong_barostat, wrong_thermostat};
 #[cfg(test)]
 pub use demo::demo_without_refit;
 pub use document::{Document, FILL_IN};

@@ -70,7 +70,7 @@ const fn range(
 }
 
 /// All ranges, by table.
-pub static RANGES: [Range; 129] = [
+pub static RANGES: [Range; 131] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -117,6 +117,8 @@ pub static RANGES: [Range; 129] = [
     range("guard.min_distances.bond_cutoff", "", [0.5, 5.0], [1.1, 1.6], RADII_FRACTION),
     range("guard.zbl.inner", "", [0.0, 20.0], [0.1, 4.0], ZBL),
     range("guard.zbl.outer", "", [0.0, 20.0], [0.2, 5.0], ZBL),
+    range("guard.wall.margin", "Å", [0.0, 1e3], [0.5, 50.0], "it is in Å"),
+    range("guard.wall.stiffness", "eV/Å²", [0.0, 1e4], [0.01, 100.0], ""),
     range("guard.max_grade", "", [0.0, 1e12], [2.0, 1e4], ""),
     range("guard.max_temperature", "K", [0.0, 1e9], [300.0, 1e6], ""),
     range("guard.max_consecutive_rejections", "", [0.0, 1e9], [1.0, 1e3], ""),

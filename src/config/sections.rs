@@ -10,8 +10,8 @@ use dft::PassedEnvironment;
 use monitor::reference_check::DifferenceBounds;
 use orchestrator::batch::CustomScheduler;
 use orchestrator::selector::{CampaignMode, OnForgetting, UpdateProtocol};
-use potentials::ZblWindows;
 use potentials::grace::Precision;
+use potentials::{WallSettings, ZblWindows};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use store::LowerStateRule;
@@ -156,6 +156,8 @@ pub struct GuardSection {
     pub min_distances: MinDistanceRule,
     /// Switched ZBL repulsion at short range. Default: none.
     pub zbl: Option<ZblWindows>,
+    /// Wall around clusters. Default: none.
+    pub wall: Option<WallSection>,
     /// Largest γ_max of a structure that is collected. Default: no limit.
     pub max_grade: Option<Positive>,
     /// Highest allowed kinetic temperature, K.
@@ -170,6 +172,16 @@ pub struct GuardSection {
     pub tau_factor: Fraction,
     /// Number of steps between checkpoints.
     pub checkpoint_interval: NonZeroU64,
+}
+
+/// `guard.wall`
+#[derive(Clone, Copy, Debug, Deserialize, Serialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct WallSection {
+    /// Distance of the wall from the atom that is farthest from the centre of mass of the seed structure, Å.
+    pub margin: Positive,
+    /// Stiffness, eV/Å².
+    pub stiffness: Positive,
 }
 
 /// `[label]`
@@ -421,11 +433,26 @@ impl Default for CampaignSection {
     }
 }
 
+impl Default for WallSection {
+    fn default() -> Self {
+        let WallSettings { margin, stiffness } = WallSettings::default();
+        Self { margin: defaults::positive(margin), stiffness: defaults::positive(stiffness) }
+    }
+}
+
+impl WallSection {
+    /// What walks need of it.
+    pub fn settings(&self) -> WallSettings {
+        WallSettings { margin: self.margin.get(), stiffness: self.stiffness.get() }
+    }
+}
+
 impl Default for GuardSection {
     fn default() -> Self {
         Self {
             min_distances: MinDistanceRule::default(),
             zbl: None,
+            wall: None,
             max_grade: None,
             max_temperature: defaults::positive(20_000.0),
             rollback: true,

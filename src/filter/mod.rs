@@ -37,6 +37,8 @@ pub struct StructureProperties<'a> {
     pub max_force: Option<f64>,
     /// Names of the retry adjustments with which the label was made.
     pub retry_adjustments: Option<&'a [String]>,
+    /// Number of fragments ([`atoms::fragments`]).
+    pub fragments: Option<usize>,
     /// The element of each atom. Empty if unknown.
     pub species: &'a [Species],
     /// `biased`, `control` or `imported`.
@@ -101,7 +103,7 @@ names! {
         Gamma "gamma", GammaNbr "gamma_nbr", RelativeVolume "relative_volume", Temperature "temperature",
         KineticTemperature "kinetic_temperature", Tau "tau", Version "version", Walk "walk", Step "step",
         MixtureVersion "mixture_version", Atoms "atoms", Energy "energy", EnergyPerAtom "energy_per_atom",
-        MaxForce "max_force"
+        MaxForce "max_force", Fragments "fragments"
     }
 }
 
@@ -183,6 +185,7 @@ impl StructureProperties<'_> {
             NumberField::Energy => self.energy,
             NumberField::EnergyPerAtom => self.energy.zip(atoms).map(|(energy, atoms)| energy / atoms),
             NumberField::MaxForce => self.max_force,
+            NumberField::Fragments => self.fragments.map(|number| number as f64),
         }
     }
 

@@ -84,6 +84,7 @@ fn candidates(text: &mut MetricsText, status: &CampaignStatus) {
         ("budget", declined.budget),
         ("backlog", declined.backlog),
         ("unlikely_to_complete", declined.unlikely_to_complete),
+        ("grade_too_large", declined.grade_too_large),
     ];
     let labels = fates.map(|(fate, _)| [("fate", fate)]);
     let samples: Vec<_> =

@@ -74,6 +74,8 @@ pub struct Declined {
     pub backlog: u64,
     /// Their labels would probably fail.
     pub unlikely_to_complete: u64,
+    /// Their grades under the original mixture are above the bound of the guard.
+    pub grade_too_large: u64,
 }
 
 /// Number of label jobs, by state.

@@ -177,7 +177,7 @@ async fn status_counts_everything_once() {
     let status = serde_json::to_value(reader.status().await.unwrap()).unwrap();
     let candidates = serde_json::json!({
         "seen": 3, "accepted": 1, "declined": { "covered": 1, "duplicate": 0, "too_close": 1, "budget": 0, "backlog": 0,
-            "unlikely_to_complete": 0 },
+            "unlikely_to_complete": 0, "grade_too_large": 0 },
         "control": 1, "rejected_by_guards": 4,
     });
     assert_eq!(status["candidates"], candidates);

@@ -1,10 +1,10 @@
 //! Biased steps per second against gracemaker's walker, `grace_uq hal`: the same model (al_eam_1l), 108 atoms, 600
-//! K, 2 fs, Langevin friction 0.01/fs, τ = 0.15, no updates of the mixture. Both run at the same time and use the
-//! machine alternately.
+//! K, 2 fs, τ = 0.15, no updates of the mixture. Both run at the same time and use the machine alternately. At constant volume with
+//! Langevin friction 0.01/fs, at 1 bar with Nosé–Hoover chains, in a fully flexible cell whose bias (`npt_stress`) has the same scale.
 //!
 //! `CALMWALK_PEER_DATA=… CALMWALK_GRACEMAKER_PYTHON=…/bin/python cargo bench -p workers --bench hal [-- ENSEMBLE…
 //! CORES…]`. Ensembles are those of `grace_uq`, by default `nvt_ramp` and `npt_stress`, on one and two cores by
-//! default. Our walk uses the integrator of the volume ramp in both.
+//! default. Our walk has the same ensemble.
 
 mod common;
 
@@ -17,7 +17,7 @@ use std::time::Instant;
 use atoms::Structure;
 use atoms::extxyz::{Frame, write_frame};
 use calm::Artifact;
-use common::{TimedWalk, crystal, quartiles};
+use common::{Ensemble, TimedWalk, crystal, quartiles};
 use potentials::grace::GraceModel;
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
@@ -52,8 +52,12 @@ fn main() {
     let model = Arc::new(GraceModel::load(&folder.join("kokkos.npz")).expect("a model"));
     let mixture = Arc::new(Artifact::load_export(folder.join("kokkos.npz")).expect("a CALM mixture").mixture);
     let seed_structure = crystal(model.elements(), 4.05);
-    let walk = TimedWalk::new(&model, &mixture, seed_structure.clone());
     for ensemble in ensembles {
+        let ours = match ensemble.as_str() {
+            "npt" | "npt_stress" => Ensemble::ConstantPressure { cell_bias: ensemble == "npt_stress" },
+            _ => Ensemble::ConstantVolume,
+        };
+        let walk = TimedWalk::new(&model, &mixture, seed_structure.clone(), ours);
         for &cores in &cores {
             let mut peer = Peer::start(&python, &folder, &seed_structure, &ensemble, cores);
             let mut walks = vec![walk.clone(); cores];
@@ -119,6 +123,7 @@ impl Peer {
         command.arg("--structure").arg(structure);
         command.args(["--ensemble", ensemble, "-T", "600", "--n-steps", "1000000", "--friction", "0.01"]);
         command.args(["--nvt-ramp", "1.0", "1.0", "--tau", "0.15", "--update", "none"]);
+        command.args(["--bulk-modulus", "0.474"]);
         command.args(["--trigger-gamma", "1e9", "--reject-gamma", "1e9"]);
         command.args(["--progress-every", &PEER_STEPS.to_string()]);
         command.arg("--output-dir").arg(directory.path().join("walker"));

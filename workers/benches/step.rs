@@ -12,7 +12,7 @@ use std::time::Instant;
 
 use atoms::{Evaluation, NeighbourList, Structure};
 use calm::{Artifact, BatchedGrades, Mixture};
-use common::{TimedWalk, crystal, quartiles};
+use common::{Ensemble, TimedWalk, crystal, quartiles};
 use potentials::grace::{Grace, GraceModel, PullBack};
 
 /// Number of measurements of a walk and of as many calls.
@@ -27,16 +27,20 @@ fn main() {
     ];
     for (name, folder, edge, steps) in models {
         match folder {
-            Some(folder) if folder.exists() => report(name, &folder, edge, steps),
+            Some(folder) if folder.exists() => {
+                for ensemble in [Ensemble::ConstantVolume, Ensemble::ConstantPressure { cell_bias: true }] {
+                    report(name, &folder, edge, steps, ensemble);
+                }
+            }
             _ => println!("{name}: not here (CALMWALK_PEER_DATA names the folder that has it)"),
         }
     }
 }
 
-fn report(name: &str, folder: &Path, edge: f64, steps: u64) {
+fn report(name: &str, folder: &Path, edge: f64, steps: u64, ensemble: Ensemble) {
     let model = Arc::new(GraceModel::load(&folder.join("kokkos.npz")).expect("a model"));
     let mixture = Arc::new(Artifact::load_export(folder.join("kokkos.npz")).expect("a CALM mixture").mixture);
-    let mut timed = TimedWalk::new(&model, &mixture, crystal(model.elements(), edge));
+    let mut timed = TimedWalk::new(&model, &mixture, crystal(model.elements(), edge), ensemble);
     let mut call = Call::new(model, mixture, timed.structure.clone());
     let (mut ratios, mut step_times, mut call_times) = (Vec::new(), Vec::new(), Vec::new());
     for round in 0..=ROUNDS {
@@ -54,7 +58,7 @@ fn report(name: &str, folder: &Path, edge: f64, steps: u64) {
             call_times.push(1e3 * alone);
         }
     }
-    println!("{name}, {} atoms, assignments of {steps} steps", timed.structure.len());
+    println!("{name}, {ensemble:?}, {} atoms, assignments of {steps} steps", timed.structure.len());
     for (what, values) in [("step, ms", step_times), ("call, ms", call_times), ("step / call", ratios)] {
         let [low, median, high] = quartiles(values);
         println!("  {what}: {median:.4} ({low:.4} to {high:.4})");

@@ -14,7 +14,7 @@ use std::sync::Arc;
 use atoms::{Evaluation, Matrix3, NeighbourList, Potential, PotentialError, Species, Structure, Vec3, cell};
 use calm::{BatchedGrades, GradeError, Grades, Mixture};
 use potentials::grace::PullBack;
-use potentials::{PotentialWithFeatures, Zbl};
+use potentials::{PotentialWithFeatures, Wall, Zbl};
 use serde::{Deserialize, Serialize};
 
 pub use work::BiasWork;
@@ -73,6 +73,8 @@ pub struct BiasedPotential {
     potential: Box<dyn PotentialWithFeatures>,
     elements: Vec<usize>,
     zbl: Option<Zbl>,
+    /// A wall around a cluster, added like the repulsion.
+    pub wall: Option<Wall>,
     mixture: Arc<Mixture>,
     /// τ; 0 leaves the dynamics unbiased and computes no grades.
     pub tau: f64,
@@ -106,6 +108,7 @@ impl BiasedPotential {
             potential,
             elements,
             zbl,
+            wall: None,
             mixture,
             tau: 0.0,
             state: BiasState::default(),
@@ -241,6 +244,9 @@ impl Potential for BiasedPotential {
         }
         if let Some(zbl) = &self.zbl {
             zbl.add(structure, neighbours, out)?;
+        }
+        if let Some(wall) = &self.wall {
+            wall.add(structure, out);
         }
         Ok(())
     }

@@ -122,10 +122,10 @@ impl CellBias {
 
     /// Whether a walk at `step` that has collected this many structures has touched the boundary so often within a window that
     /// it ends.
-    pub fn ends(&self, settings: &CellBiasSettings, step: u64, collected: usize) -> bool {
+    pub fn ends(&self, settings: &CellBiasSettings, step: u64, collected: u64) -> bool {
         let recent = |contact: &&u64| step.saturating_sub(**contact) <= settings.window;
         let contacts = self.contacts.iter().filter(recent).count();
-        collected >= settings.collected_to_end as usize && contacts >= settings.contacts_to_end as usize
+        collected >= u64::from(settings.collected_to_end) && contacts >= settings.contacts_to_end as usize
     }
 }
 

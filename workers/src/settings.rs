@@ -2,7 +2,7 @@
 
 use atoms::MinDistanceRule;
 use md::BarostatSettings;
-use potentials::ZblWindows;
+use potentials::{WallSettings, ZblWindows};
 use serde::{Deserialize, Serialize};
 
 use crate::cell_bias::CellBiasSettings;
@@ -43,6 +43,8 @@ pub struct WalkSettings {
     pub min_interval_after_decline: u64,
     /// Windows of the switched ZBL repulsion; `None` without one.
     pub zbl: Option<ZblWindows>,
+    /// The wall around clusters; `None` without one.
+    pub wall: Option<WallSettings>,
     /// Guards.
     pub guard: GuardSettings,
 }
@@ -58,7 +60,7 @@ pub struct GuardSettings {
     pub max_temperature: f64,
     /// Whether a walk rolls back to a checkpoint after rejections; if not, it continues.
     pub rollback: bool,
-    /// Consecutive rejections by the same guard after which the walk rolls back to a checkpoint.
+    /// Consecutive rejections, by any guard, after which the walk rolls back to a checkpoint.
     pub max_consecutive_rejections: u32,
     /// Number of roll backs after which the walk ends instead.
     pub max_rollbacks: u32,

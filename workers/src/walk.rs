@@ -6,6 +6,8 @@
 mod candidate;
 mod constant_pressure;
 mod error;
+mod initial_dynamics;
+mod start;
 mod state;
 mod trace;
 mod update_work;
@@ -16,7 +18,7 @@ use atoms::ShortestDistances;
 use calm::{CollectionRule, Mixture};
 use md::{Dynamics, Stream};
 use potentials::grace::Threads;
-use potentials::{ModelWithFeatures, Zbl};
+use potentials::{ModelWithFeatures, Wall, Zbl};
 use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd, WalkProgress};
 use wire::{Candidate, Origin, TracePoint};
 
@@ -25,7 +27,8 @@ use crate::cell_bias::CellBias;
 use crate::guard;
 use crate::settings::WalkSettings;
 use error::WalkError;
-use state::{CollectionPoint, GoodState, WalkState, start};
+use start::start;
+use state::{GoodState, WalkState};
 
 /// Data shared by every walk of a campaign.
 #[derive(Clone)]
@@ -50,22 +53,10 @@ pub fn advance(
     stopping: impl Fn() -> bool,
     on_progress: impl Fn(WalkProgress),
 ) -> Result<AssignmentReport<Candidate>, PotentialUnavailable> {
-    let (walk, number) = (assignment.walk, assignment.number);
     let mut running = match RunningWalk::start_or_resume(context, assignment, mixture) {
         Ok(running) => running,
         Err(WalkError::Unavailable(reason)) => return Err(PotentialUnavailable(reason)),
-        Err(error) => {
-            let end = WalkEnd::InvalidStart { reason: error.to_string() };
-            let checkpoint = assignment.checkpoint.clone().unwrap_or_default();
-            return Ok(AssignmentReport {
-                walk,
-                assignment: number,
-                outcome: Outcome::Ended(end),
-                checkpoint,
-                progress: WalkProgress::default(),
-                trace: Vec::new(),
-            });
-        }
+        Err(error) => return Ok(without_a_step(assignment, error.to_string())),
     };
     let outcome = match running.run(&stopping, &on_progress) {
         Ok(outcome) => outcome,
@@ -73,13 +64,29 @@ pub fn advance(
         Err(error) => Outcome::Ended(WalkEnd::Diverged { reason: format!("{}: {error}", running.place()) }),
     };
     Ok(AssignmentReport {
-        walk,
-        assignment: number,
+        walk: assignment.walk,
+        assignment: assignment.number,
         outcome,
         checkpoint: running.encode(),
         progress: running.progress(),
         trace: running.take_trace(),
     })
+}
+
+/// The report on a walk that ends before it makes a step, at its start or at its checkpoint, and why.
+pub(crate) fn without_a_step(assignment: &Assignment, reason: String) -> AssignmentReport<Candidate> {
+    let end = match assignment.checkpoint {
+        None => WalkEnd::InvalidStart { reason },
+        Some(_) => WalkEnd::Diverged { reason },
+    };
+    AssignmentReport {
+        walk: assignment.walk,
+        assignment: assignment.number,
+        outcome: Outcome::Ended(end),
+        checkpoint: assignment.checkpoint.clone().unwrap_or_default(),
+        progress: WalkProgress::default(),
+        trace: Vec::new(),
+    }
 }
 
 /// The program that evaluates the potential does not answer any more.
@@ -114,6 +121,8 @@ impl<'a> RunningWalk<'a> {
         let bias_averaging_steps = settings.bias_averaging_steps;
         let evaluator = Arc::clone(model).evaluator(threads.clone());
         let mut potential = BiasedPotential::new(evaluator, mixture, zbl, bias_averaging_steps, species)?;
+        let cluster = Some(&assignment.seed_structure).filter(|seed| seed.periodic == [false; 3]);
+        potential.wall = cluster.zip(settings.wall).map(|(cluster, wall)| Wall::around(cluster, &wall));
         let (dynamics, state) = match &assignment.checkpoint {
             None => start(settings, assignment, &mut potential)?,
             Some(bytes) => {
@@ -124,7 +133,7 @@ impl<'a> RunningWalk<'a> {
         };
         potential.state = state.bias;
         let collection = settings.collection.with_threshold_factor(assignment.threshold_factor);
-        let mut walk = Self {
+        Ok(Self {
             settings,
             assignment,
             model: &**model,
@@ -134,13 +143,17 @@ impl<'a> RunningWalk<'a> {
             potential,
             state,
             trace: Vec::new(),
-        };
-        walk.apply_verdict();
-        walk.remove_update_work()?;
-        if assignment.checkpoint.is_none() {
-            walk.trace_if_due()?;
+        })
+    }
+
+    /// What comes before the first step of an assignment.
+    fn begin(&mut self) -> Result<(), WalkError> {
+        self.apply_verdict();
+        self.remove_update_work()?;
+        if self.assignment.checkpoint.is_none() {
+            self.trace_if_due()?;
         }
-        Ok(walk)
+        Ok(())
     }
 
     /// Sets the earliest step of the next candidate: after a collection the walk waits out the full interval, after
@@ -150,7 +163,7 @@ impl<'a> RunningWalk<'a> {
         match &self.assignment.verdict {
             None => {}
             Some(Verdict::Accepted) => {
-                self.state.collected.push(CollectionPoint { branch: step, beyond: 0 });
+                self.state.collect(step, self.settings);
                 self.state.next_offer = step + self.settings.min_interval;
             }
             Some(Verdict::Declined(_)) => {
@@ -164,6 +177,7 @@ impl<'a> RunningWalk<'a> {
         stopping: &impl Fn() -> bool,
         on_progress: &impl Fn(WalkProgress),
     ) -> Result<Outcome<Candidate>, WalkError> {
+        self.begin()?;
         if let Some(interrupted) = self.finish_reference_run(stopping, on_progress)? {
             return Ok(interrupted);
         }

@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 
 use tracing::debug;
 use wire::Candidate;
-use wire::messages::{AssignmentReport, Outcome, WalkEnd, WalkProgress};
+use wire::messages::{AssignmentReport, Outcome, WalkProgress};
 use wire::transport::{Transport, WorkItem};
 
-use crate::walk::{PotentialUnavailable, WalkContext, advance};
+use crate::walk::{PotentialUnavailable, WalkContext, advance, without_a_step};
 
 /// Minimum time between two progress reports; longer steps make it longer.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(100);
@@ -88,13 +88,5 @@ fn log_outcome(work: &WorkItem, made: &AssignmentReport<Candidate>, time: Durati
 }
 
 fn crash_report(work: &WorkItem) -> AssignmentReport<Candidate> {
-    let end = WalkEnd::InvalidStart { reason: "the walker crashed: this is a defect of calmwalk".to_owned() };
-    AssignmentReport {
-        walk: work.assignment.walk,
-        assignment: work.assignment.number,
-        outcome: Outcome::Ended(end),
-        checkpoint: work.assignment.checkpoint.clone().unwrap_or_default(),
-        progress: WalkProgress::default(),
-        trace: Vec::new(),
-    }
+    without_a_step(&work.assignment, "the walker crashed: this is a defect of calmwalk".to_owned())
 }

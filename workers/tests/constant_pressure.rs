@@ -83,8 +83,10 @@ fn a_reference_run_and_a_biased_cell_continue_from_any_step() {
     assert_eq!((&whole.outcome, whole.progress.step), (&Outcome::StepsDone, 90));
     let context =
         WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings.clone()) };
-    let mut next = from(conditions(1.02, true), 500);
-    // Interrupted twice in the reference run, which counts no steps of the walk.
+    // Interrupted twice in the reference run, of which an assignment makes as many steps as it would make of the walk.
+    let undisturbed = run(&settings, &from(conditions(1.02, true), 40));
+    assert_eq!((&undisturbed.outcome, undisturbed.progress.step), (&Outcome::StepsDone, 0));
+    let mut next = from(conditions(1.02, true), 40);
     for steps in [7, 31] {
         let asked = AtomicU64::new(0);
         let stopping = || asked.fetch_add(1, Ordering::Relaxed) == steps;
@@ -92,15 +94,16 @@ fn a_reference_run_and_a_biased_cell_continue_from_any_step() {
         assert_eq!((&report.outcome, report.progress.step), (&Outcome::Interrupted, 0));
         next.checkpoint = Some(report.checkpoint);
     }
-    // An assignment has as many steps of it as it would have of the walk.
-    next.last_step = 5;
     let report = run(&settings, &next);
     assert_eq!((&report.outcome, report.progress.step), (&Outcome::StepsDone, 0));
+    assert_eq!(report.checkpoint, undisturbed.checkpoint, "interruptions are no steps");
     next.checkpoint = Some(report.checkpoint);
-    for last_step in [20, 21, 33, 90] {
+    for last_step in [5, 20, 21, 33, 90] {
+        next.number += 1;
         next.last_step = last_step;
         let report = run(&settings, &next);
-        assert_eq!((&report.outcome, report.progress.step), (&Outcome::StepsDone, last_step));
+        let expected = if last_step == 5 { 0 } else { last_step };
+        assert_eq!((&report.outcome, report.progress.step), (&Outcome::StepsDone, expected));
         next.checkpoint = Some(report.checkpoint);
     }
     assert_eq!(next.checkpoint, Some(whole.checkpoint));
@@ -122,6 +125,37 @@ fn a_control_walk_is_the_unbiased_walk() {
     let settings = WalkSettings { cell_bias: CellBiasSettings { gain: 0.1, ..quick() }, ..settings };
     let walk = |bias| run(&settings, &from(conditions(1.0, bias), 150)).progress.relative_volume;
     assert_ne!(walk(true), walk(false));
+}
+
+/// Without a bias, a walk is what the dynamics of the model give without any of the walk's code: bit for bit.
+#[test]
+fn a_control_walk_is_plain_dynamics_of_the_model() {
+    let settings =
+        WalkSettings { reference_steps: 0, zbl: None, cell_bias: quick(), ..at_constant_pressure() };
+    let found = frame(&settings, conditions(1.03, true), 150);
+    let model = model();
+    let mut grace = Grace::new(Arc::clone(&model));
+    let stream = Stream::new(settings.rng_seed, 0, 0);
+    let mut state = State::thermal(seed_structure("vacancy"), 600.0, &stream);
+    let volume = md::extent(&state.structure);
+    md::scale_volume(&mut state.structure, 1.03 * volume / volume);
+    let thermostat = settings.thermostat.start(600.0);
+    let run = DynamicsSettings {
+        time_step: 2.0,
+        thermostat: thermostat.clone(),
+        cell_motion: md::CellMotion::Fixed,
+        stream,
+        skin: settings.skin,
+    };
+    let mut dynamics = Dynamics::new(state, run, &mut grace).unwrap();
+    (0..settings.equilibration_steps).for_each(|_| dynamics.step(&mut grace).unwrap());
+    let barostat = settings.barostat.start(600.0, &thermostat, dynamics.structure());
+    dynamics.set_cell_motion(barostat.into()).unwrap();
+    (settings.equilibration_steps..150).for_each(|_| dynamics.step(&mut grace).unwrap());
+    assert!((dynamics.structure().cell.volume() / volume - 1.03).abs() > 1e-3, "the cell moves");
+    assert_eq!(found.structure, *dynamics.structure());
+    assert_eq!(found.forces, dynamics.evaluation().forces);
+    assert_eq!(found.temperature, dynamics.temperature());
 }
 
 /// The stress does work on the cell, which goes where grades are larger.

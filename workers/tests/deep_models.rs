@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use atoms::{Cell, Evaluation, NeighbourList, Potential, Structure, Vec3, cell};
+use atoms::{Cell, Evaluation, Matrix3, NeighbourList, Potential, Structure, Vec3, cell};
 use calm::{Component, Mixture};
 use potentials::grace::{Grace, GraceModel};
 use workers::bias::BiasedPotential;
@@ -87,13 +87,87 @@ fn check(name: &str) {
         assert!(error <= 1e-7 * largest, "{name}: atom {atom}: {error:e} of {largest}");
     }
 
-    let strain = derivative(1e-4, |strain| {
+    let largest = strain_derivative.iter().flatten().fold(0.0, |m: f64, w| m.max(w.abs()));
+    for (k, l) in (0..9).map(|number| (number / 3, number % 3)) {
+        let strain = derivative(1e-4, |strain| {
+            let mut moved = structure.clone();
+            moved.positions.iter_mut().chain(&mut moved.cell.0).for_each(|x| x[l] += strain * x[k]);
+            sum_of_grades(&moved)
+        });
+        let found = strain_derivative[k][l];
+        assert!((found - strain).abs() <= 1e-7 * largest, "{name}: {k} {l}: {found} is not {strain}");
+    }
+}
+
+/// A rotation about an oblique axis, of row vectors.
+const TURN: Matrix3 = [
+    [2.0 / 3.0, -1.0 / 3.0, 2.0 / 3.0],
+    [2.0 / 3.0, 2.0 / 3.0, -1.0 / 3.0],
+    [-1.0 / 3.0, 2.0 / 3.0, 2.0 / 3.0],
+];
+
+fn product(a: &Matrix3, b: &Matrix3) -> Matrix3 {
+    a.map(|row| cell::row_times(row, b))
+}
+
+fn transposed(a: &Matrix3) -> Matrix3 {
+    std::array::from_fn(|k| std::array::from_fn(|l| a[l][k]))
+}
+
+fn distance(found: &[Vec3], expected: &[Vec3]) -> f64 {
+    let size = expected.iter().map(|v| cell::norm(*v)).fold(0.0, f64::max);
+    found.iter().zip(expected).map(|(a, b)| cell::norm(cell::sub(*a, *b))).fold(0.0, f64::max) / size
+}
+
+/// The biased forces, σ_bias for τ_s B = 1 and the energy after two evaluations, at the structure and with its atoms moved.
+fn biased(
+    model: &Arc<GraceModel>,
+    mixture: &Arc<Mixture>,
+    structure: &Structure,
+    moved: &Structure,
+) -> (Evaluation, Matrix3) {
+    let grace = Box::new(Grace::new(Arc::clone(model)));
+    let mut potential =
+        BiasedPotential::new(grace, Arc::clone(mixture), None, 1, &structure.species).unwrap();
+    potential.tau = 0.3;
+    evaluate(&mut potential, structure);
+    let (_, evaluation) = evaluate(&mut potential, moved);
+    assert!(potential.bias_scale() > 0.0);
+    (evaluation, potential.cell_stress(1.0))
+}
+
+/// The bias on atoms and cell turns with the structure and follows its atoms wherever they stand in the list.
+#[test]
+fn the_bias_is_that_of_a_turned_and_a_reordered_structure() {
+    for name in ["two_layers.npz", "three_layers.npz"] {
+        let (model, structure) = (model(name), alloy());
+        let mixture = mixture(&model, &structure);
         let mut moved = structure.clone();
-        moved.positions.iter_mut().chain(&mut moved.cell.0).for_each(|x| x[1] += strain * x[0]);
-        sum_of_grades(&moved)
-    });
-    let found = strain_derivative[0][1];
-    assert!((found - strain).abs() <= 1e-7 * strain.abs(), "{name}: {found} is not {strain}");
+        moved.positions.iter_mut().enumerate().for_each(|(k, r)| r[(k + 1) % 3] += 0.1);
+        let (expected, stress) = biased(&model, &mixture, &structure, &moved);
+        assert!((stress.as_flattened().iter().map(|x| x * x).sum::<f64>() - 1.0).abs() < 1e-12, "{stress:?}");
+
+        let turn = |structure: &Structure| Structure {
+            positions: structure.positions.iter().map(|r| cell::row_times(*r, &TURN)).collect(),
+            cell: Cell(product(&structure.cell.0, &TURN)),
+            ..structure.clone()
+        };
+        let (found, turned_stress) = biased(&model, &mixture, &turn(&structure), &turn(&moved));
+        let forces: Vec<Vec3> = expected.forces.iter().map(|f| cell::row_times(*f, &TURN)).collect();
+        assert!(distance(&found.forces, &forces) < 1e-10, "{name}");
+        let turned = product(&transposed(&TURN), &product(&stress, &TURN));
+        assert!(distance(&turned_stress, &turned) < 1e-10, "{name}: {turned_stress:?} is not {turned:?}");
+
+        let order = [2, 0, 3, 1];
+        let reorder = |structure: &Structure| Structure {
+            species: order.map(|k: usize| structure.species[k]).to_vec(),
+            positions: order.map(|k| structure.positions[k]).to_vec(),
+            ..structure.clone()
+        };
+        let (found, same_stress) = biased(&model, &mixture, &reorder(&structure), &reorder(&moved));
+        assert!(distance(&found.forces, &order.map(|k| expected.forces[k])) < 1e-10, "{name}");
+        assert!(distance(&same_stress, &stress) < 1e-10, "{name}: {same_stress:?} is not {stress:?}");
+    }
 }
 
 #[test]

@@ -124,9 +124,34 @@ fn the_work_of_the_bias_is_the_gain_of_energy() {
         missing_energy(&report.trace)
     };
     let [(coarse, work), (fine, _)] = [2.0, 1.0].map(walk);
-    assert!(work.abs() > 0.3, "{work}");
-    assert!(coarse < 0.05 * work.abs(), "{coarse} of {work}");
+    assert!(work > 0.3, "{work}");
+    assert!(coarse < 0.05 * work, "{coarse} of {work}");
     assert!(fine < 0.4 * coarse, "{fine} after {coarse}");
+}
+
+/// It pushes atoms to where grades are larger, so its mean work is positive, and grades are larger than without it.
+#[test]
+fn the_bias_works_along_the_gradient_of_the_grades() {
+    let walks = |tau: f64| {
+        let walk = |(number, name): (u64, &str)| {
+            let settings = WalkSettings { rng_seed: number, thermostat: settings().thermostat, ..steady() };
+            let first = Assignment { seed_structure: seed_structure(name), ..on_the_slab(tau, 400) };
+            let trace = run(&settings, &first).trace;
+            let late = &trace[trace.len() / 2..];
+            let grade = late.iter().map(|point| point.gamma_max.unwrap()).sum::<f64>() / late.len() as f64;
+            (trace.last().unwrap().bias_work, grade)
+        };
+        let names = ["slab-111", "vacancy", "fcc-100", "slab-111", "vacancy", "fcc-103"];
+        (1..).zip(names).map(walk).collect::<Vec<_>>()
+    };
+    let (biased, weak) = (walks(0.3), walks(1e-9));
+    let works: Vec<f64> = biased.iter().map(|(work, _)| *work).collect();
+    let mean = works.iter().sum::<f64>() / works.len() as f64;
+    let variance = works.iter().map(|work| (work - mean).powi(2)).sum::<f64>() / (works.len() - 1) as f64;
+    let error = (variance / works.len() as f64).sqrt();
+    assert!(mean > 2.0 * error && mean > 0.1, "{mean} ± {error} eV: {works:?}");
+    let larger = biased.iter().zip(&weak).filter(|((_, with), (_, without))| with > without).count();
+    assert!(larger >= 5, "{biased:?} {weak:?}");
 }
 
 /// The bias on a moving cell is counted by its barostat, that on the atoms is the work of the trace: nothing is missing.

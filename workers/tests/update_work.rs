@@ -60,6 +60,37 @@ fn the_work_of_an_update_is_taken_out_of_the_kinetic_energy() {
     }
 }
 
+/// The velocities after an update meet the force of the step before: their smaller power is that of the work.
+#[test]
+fn the_work_of_the_bias_goes_on_with_the_smaller_velocities() {
+    let settings = WalkSettings { thermostat: md::ThermostatSettings::None {}, zbl: None, ..eager() };
+    let mut next = assignment(seed_structure("slab-111"), 500);
+    next.conditions =
+        wire::WalkConditions { temperature: 50.0, tau: 1.0, volume_ramp: None, ..next.conditions };
+    for _ in 0..2 {
+        let report = run(&settings, &next);
+        (next.checkpoint, next.verdict) = (Some(report.checkpoint), Some(Verdict::Accepted));
+    }
+    let report = run(&settings, &next);
+    let Outcome::Candidate(candidate) = &report.outcome else { panic!("no candidate") };
+    let mixture = mixture();
+    let elements = model().element_indices(&candidate.structure.species).unwrap();
+    let batch = Batch::new(&mixture, &elements, &candidate.features).unwrap();
+    let changed = batch.updated(CovarianceUpdate::Convex { alpha: 1.0 }).unwrap();
+    let after = Arc::new(mixture.with_changes(&changed).unwrap());
+    (next.checkpoint, next.last_step) = (Some(report.checkpoint.clone()), candidate.id.step + 1);
+    let point = under(&settings, after, &next).trace.pop().unwrap();
+    let [earlier, before] = report.trace.last_chunk::<2>().unwrap();
+    assert_eq!((point.step, before.step), (before.step + 1, earlier.step + 1));
+    let factor = (point.temperature / before.temperature).sqrt();
+    // What the bias gave before the update, at the rate of the last step, and what is left of it with the smaller velocities.
+    let wrong = 0.5 * (before.bias_work - earlier.bias_work) * (1.0 - factor);
+    let gained = point.conserved_energy.unwrap() - before.conserved_energy.unwrap();
+    let missing = gained - (point.bias_work - before.bias_work);
+    assert!(factor < 0.9, "{before:?} {point:?}");
+    assert!(missing.abs() < 0.3 * wrong.abs(), "{missing} of {wrong}");
+}
+
 /// The work is taken out once, however the walk is interrupted.
 #[test]
 fn an_interruption_after_an_update_changes_nothing() {

@@ -10,7 +10,7 @@ use atoms::{
 use calm::{Artifact, CollectionRule, Grades, Mixture};
 use md::{BarostatSettings, LangevinSettings, ThermostatSettings};
 use potentials::grace::{Grace, GraceModel, PullBack, Threads};
-use potentials::{ZblWindow, ZblWindows};
+use potentials::{WallSettings, ZblWindow, ZblWindows};
 use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd};
 use wire::{CampaignId, Candidate, Origin, WalkConditions, WalkId};
 use workers::bias::BiasedPotential;
@@ -59,6 +59,7 @@ pub fn settings() -> WalkSettings {
         min_interval: 200,
         min_interval_after_decline: 20,
         zbl: uniform_zbl(1.6, 2.4),
+        wall: None,
         guard: GuardSettings {
             min_distances: MinDistanceRule::Uniform(Uniform::default()),
             max_grade: None,
@@ -177,7 +178,15 @@ fn damaged_checkpoints_do_not_stop_a_walker() {
         let go = || advance(&context, &next, Arc::clone(&mixture), || false, |_| {}).unwrap();
         let report = catch_unwind(AssertUnwindSafe(go));
         let report = report.unwrap_or_else(|_| panic!("a panic at mutation {number}"));
-        refused += u32::from(matches!(report.outcome, Outcome::Ended(WalkEnd::InvalidStart { .. })));
+        let unreadable = |reason: &str| reason.contains("the walk's checkpoint cannot be read");
+        match &report.outcome {
+            Outcome::Ended(WalkEnd::Diverged { reason }) if unreadable(reason) => {
+                assert_eq!(Some(report.checkpoint), next.checkpoint);
+                refused += 1;
+            }
+            Outcome::Ended(WalkEnd::InvalidStart { reason }) => panic!("this is not its start: {reason}"),
+            _ => {}
+        }
     }
     assert!(refused > 0);
 }
@@ -301,6 +310,62 @@ fn the_skin_changes_nothing() {
     let lost = |outcome: &Outcome<Candidate>| matches!(outcome, Outcome::Ended(WalkEnd::Diverged { reason }) if reason.contains("no neighbour"));
     assert!(lost(&ends[0].0), "{:?}", ends[0]);
     assert!(ends.iter().all(|end| *end == ends[0]), "{ends:?}");
+}
+
+/// Of its collections, a walk remembers those that a roll back could still count from.
+#[test]
+fn the_checkpoint_does_not_grow_with_collections() {
+    let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 1e-9").unwrap();
+    let guard = GuardSettings { checkpoint_interval: 20, ..settings().guard };
+    let settings = WalkSettings { collection, min_interval: 1, trace_interval: 0, guard, ..settings() };
+    let context = WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings) };
+    let (mut next, mixture) = (first_of("vacancy", conditions()), mixture());
+    let mut sizes = Vec::new();
+    for _ in 0..200 {
+        let report = advance(&context, &next, Arc::clone(&mixture), || false, |_| {}).unwrap();
+        assert!(matches!(report.outcome, Outcome::Candidate(_)), "{:?}", report.outcome);
+        sizes.push(report.checkpoint.len());
+        next.checkpoint = Some(report.checkpoint);
+        next.verdict = Some(Verdict::Accepted);
+        next.last_step += 1000;
+    }
+    let largest = |sizes: &[usize]| *sizes.iter().max().unwrap();
+    // Steps are written in as few bytes as they need.
+    assert!(largest(&sizes[100..]) < largest(&sizes[..100]) + 60, "{sizes:?}");
+}
+
+/// Five hot atoms of a cluster fly apart; a wall holds them together, also where the walk goes on from a checkpoint. A wall is nothing
+/// to a crystal.
+#[test]
+fn a_wall_holds_a_cluster_together() {
+    let mut cluster = seed_structure("fcc-100");
+    cluster.periodic = [false; 3];
+    cluster.species.truncate(5);
+    cluster.positions.truncate(5);
+    let end = |wall: Option<WallSettings>, structure: &Structure, steps: &[u64]| {
+        let settings = WalkSettings { wall, collection: never(), ..settings() };
+        let conditions = WalkConditions { temperature: 6000.0, volume_ramp: None, ..conditions() };
+        let mut next = Assignment { conditions, ..assignment(structure.clone(), 0) };
+        for last_step in steps {
+            next.last_step = *last_step;
+            let report = run(&settings, &next);
+            next.number += 1;
+            next.checkpoint = Some(report.checkpoint);
+            if report.outcome != Outcome::StepsDone {
+                return (report.outcome, report.progress);
+            }
+        }
+        (Outcome::StepsDone, run(&settings, &next).progress)
+    };
+    let lost = |outcome: &Outcome<Candidate>| matches!(outcome, Outcome::Ended(WalkEnd::Diverged { reason }) if reason.contains("no neighbour"));
+    let (free, _) = end(None, &cluster, &[400]);
+    assert!(lost(&free), "{free:?}");
+    let wall = Some(WallSettings { margin: 1.0, stiffness: 5.0 });
+    let (held, progress) = end(wall, &cluster, &[400]);
+    assert_eq!((&held, progress.step), (&Outcome::StepsDone, 400));
+    assert_eq!(end(wall, &cluster, &[100, 250, 400]), (held, progress));
+    let crystal = seed_structure("fcc-100");
+    assert_eq!(end(wall, &crystal, &[60]), end(None, &crystal, &[60]));
 }
 
 #[test]

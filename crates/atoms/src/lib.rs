@@ -6,6 +6,7 @@ pub mod cell;
 mod covalent_radius;
 mod element_pair;
 pub mod extxyz;
+mod fragments;
 pub mod lammps_dump;
 mod min_distances;
 mod neighbours;
@@ -20,6 +21,7 @@ pub mod units;
 
 pub use cell::{Cell, Matrix3, Vec3};
 pub use element_pair::{ElementPair, ShortestDistances};
+pub use fragments::{BOND_FACTOR, fragments};
 pub use min_distances::{CloseContact, MinDistanceRule, MinDistances, PerPair, Uniform};
 pub use neighbours::{Bond, Neighbour, NeighbourList, shortest_distance};
 pub use potential::{Evaluation, Potential, PotentialError};

@@ -1,7 +1,9 @@
 //! What a moving cell must not depend on, where it stops, and what is refused.
 
 use atoms::cell::{add, cross, norm, row_times, scale, sub};
-use atoms::{Matrix3, Structure, Vec3};
+use atoms::{
+    Evaluation, Matrix3, NeighbourList, Potential, PotentialError, Repetition, Species, Structure, Vec3,
+};
 use md::{
     BAR_PER_EV_A3, BarostatSettings, CellFreedom, Checkpoint, Dynamics, DynamicsError, DynamicsSettings,
     NoseHooverChain, State, Thermostat,
@@ -229,4 +231,83 @@ fn a_cell_that_is_torn_apart_ends_in_an_error() {
     assert!(matches!(end(slow), DynamicsError::CellVolume { ratio, .. } if ratio > 4.0));
     let fast = BarostatSettings { pressure: -1e7, ..usual };
     assert!(matches!(end(fast), DynamicsError::CellStrain { percent, .. } if percent > 5.0));
+}
+
+/// Argon whose virial is lost after some evaluations.
+struct WithoutVirial(LennardJones);
+
+impl Potential for WithoutVirial {
+    fn cutoff(&self) -> f64 {
+        self.0.cutoff()
+    }
+
+    fn species(&self) -> &[Species] {
+        self.0.species()
+    }
+
+    fn evaluate(
+        &mut self,
+        structure: &Structure,
+        neighbours: &NeighbourList,
+        out: &mut Evaluation,
+    ) -> Result<(), PotentialError> {
+        self.0.evaluate(structure, neighbours, out)?;
+        if self.0.evaluations > 3 {
+            out.virial[1][2] = f64::NAN;
+        }
+        Ok(())
+    }
+}
+
+#[test]
+fn a_stress_that_is_not_finite_ends_a_run_with_a_barostat_only() {
+    let end = |with_a_barostat: bool| {
+        let structure = argon_crystal(2);
+        let mut run = settings(4.0, chain());
+        if with_a_barostat {
+            run = with_barostat(run, &barostat(CellFreedom::Flexible), 20.0, &structure);
+        }
+        let state = State::thermal(structure, 20.0, &run.stream);
+        let mut potential = WithoutVirial(LennardJones::argon());
+        let mut dynamics = Dynamics::new(state, run, &mut potential).unwrap();
+        (0..10).find_map(|_| dynamics.step(&mut potential).err())
+    };
+    // The first evaluation is that of the start.
+    assert!(matches!(end(true), Some(DynamicsError::StressNotFinite { step: 2 })), "{:?}", end(true));
+    assert!(end(false).is_none());
+}
+
+/// A cell of 5.4 Å and a cutoff of 7 Å: each atom sees several images of its neighbours and of itself. At any volume its energy,
+/// forces and virial are those of a supercell, and the enthalpy is conserved to second order in the time step.
+#[test]
+fn a_cell_thinner_than_the_cutoff_moves_like_any_other() {
+    let mut potential = LennardJones::argon();
+    let mut pressed = |time_step: f64| {
+        let structure = argon_crystal(1);
+        let set = BarostatSettings { pressure: 3000.0, ..barostat(CellFreedom::Flexible) };
+        let run = with_barostat(settings(time_step, Thermostat::None), &set, 20.0, &structure);
+        let start = State::thermal(structure, 20.0, &run.stream);
+        let mut dynamics = Dynamics::new(start, run, &mut potential).unwrap();
+        let (volume, enthalpy) = (dynamics.structure().cell.volume(), dynamics.conserved_energy().unwrap());
+        let (mut smallest, mut error) = (volume, 0.0_f64);
+        for _ in 0..(1000.0 / time_step) as u64 {
+            dynamics.step(&mut potential).unwrap();
+            smallest = smallest.min(dynamics.structure().cell.volume());
+            error = error.max((dynamics.conserved_energy().unwrap() - enthalpy).abs());
+        }
+        assert!(smallest < 0.9 * volume, "{smallest} of {volume} Å³");
+        (dynamics, error)
+    };
+    let ((_, coarse), (dynamics, fine)) = (pressed(2.0), pressed(1.0));
+    assert!(fine < 0.3 * coarse, "{fine} eV after {coarse} eV");
+    let repetition = Repetition::for_size(dynamics.structure(), 1, 15.0);
+    let wide = dynamics.structure().repeated(repetition);
+    let mut neighbours = NeighbourList::new(potential.cutoff(), 0.0);
+    neighbours.update(&wide).unwrap();
+    let mut expected = Evaluation::default();
+    potential.evaluate(&wide, &neighbours, &mut expected).unwrap();
+    let (cells, found) = (repetition.cells() as f64, dynamics.evaluation());
+    assert!(cells >= 27.0 && (found.energy() * cells - expected.energy()).abs() < 1e-9);
+    assert!(distance(&found.forces, &expected.forces[..4]) < 1e-9);
+    assert!(distance(&found.virial.map(|row| scale(row, cells)), &expected.virial) < 1e-9);
 }

@@ -10,7 +10,11 @@ fn within_five_errors(what: &str, [found, error]: [f64; 2], expected: f64) {
     assert!((found - expected).abs() < 5.0 * error, "{what}: {found} ± {error}, expected {expected}");
 }
 
-/// ⟨K⟩ = g k_B T / 2 and ⟨(K − ⟨K⟩)²⟩ = g (k_B T)² / 2.
+/// Quartiles of the Gamma laws of shape 93/2 and 96/2 (`scipy.stats.gamma(n).ppf`).
+const AT_REST: [f64; 3] = [41.73723129570833, 46.16709480560558, 50.90004505226711];
+const FREE: [f64; 3] = [43.16334185162806, 47.66708132493373, 52.47391398204094];
+
+/// ⟨K⟩ = g k_B T / 2 and ⟨(K − ⟨K⟩)²⟩ = g (k_B T)² / 2; K / k_B T follows the Gamma law of shape g / 2.
 fn kinetic_energy_is_canonical(temperature: f64, thermostat: Thermostat) {
     let (mut dynamics, mut potential) = warm_argon(2, temperature, settings(4.0, thermostat), 1000);
     let series: Vec<f64> = (0..40_000)
@@ -23,6 +27,11 @@ fn kinetic_energy_is_canonical(temperature: f64, thermostat: Thermostat) {
     let (freedom, thermal) = (dynamics.degrees_of_freedom() as f64, BOLTZMANN * temperature);
     within_five_errors("mean", mean, 0.5 * freedom * thermal);
     within_five_errors("variance", variance, 0.5 * freedom * thermal * thermal);
+    let quartiles = if freedom == 93.0 { AT_REST } else { FREE };
+    for (quartile, share) in quartiles.into_iter().zip([0.25, 0.5, 0.75]) {
+        let below: Vec<f64> = series.iter().map(|k| f64::from(*k < quartile * thermal)).collect();
+        within_five_errors("share below a quartile", mean_and_variance(&below, 50).0, share);
+    }
 }
 
 #[test]
@@ -45,7 +54,7 @@ fn velocity_rescaling_kinetic_energy_is_canonical() {
 }
 
 /// The histograms of the potential energy at two temperatures have the ratio of the Boltzmann factors, ln(p₁/p₂) = (β₂ −
-/// β₁) E + constant (Shirts, J. Chem. Theory Comput. 9, 909 (2013)).
+/// β₁) E + constant (Shirts, J. Chem. Theory Comput. 9, 909 (2013)). All thermostats give the same mean energy.
 #[test]
 fn energies_at_two_temperatures_have_the_boltzmann_ratio() {
     let [cold, hot] = [60.0, 66.0];
@@ -54,6 +63,7 @@ fn energies_at_two_temperatures_have_the_boltzmann_ratio() {
         |temperature| Thermostat::NoseHooverChain(NoseHooverChain::new(temperature, 200.0, 3)),
         rescaling,
     ];
+    let mut means = Vec::new();
     for thermostat in thermostats {
         let [first, second] = [cold, hot].map(|temperature| {
             let settings = settings(4.0, thermostat(temperature));
@@ -68,6 +78,14 @@ fn energies_at_two_temperatures_have_the_boltzmann_ratio() {
         let [slope, error] = log_odds_slope(&first, &second, 20);
         assert!(error < 0.15 * expected.abs(), "{slope} ± {error} 1/eV");
         assert!((slope - expected).abs() < 5.0 * error, "{slope} ± {error} 1/eV, expected {expected}");
+        means.push(mean_and_variance(&first, 20).0);
+    }
+    for [mean, error] in &means {
+        // 1 K of the harmonic crystal.
+        assert!(*error < 1.5 * 32.0 * BOLTZMANN, "{means:?}");
+        for [other, its_error] in &means {
+            assert!((mean - other).abs() < 5.0 * error.hypot(*its_error), "{means:?}");
+        }
     }
 }
 

@@ -11,6 +11,7 @@ mod potential_file;
 mod setfl;
 mod stillinger_weber;
 mod stillinger_weber_file;
+mod wall;
 mod zbl;
 mod zbl_windows;
 
@@ -19,5 +20,6 @@ pub use features::{ModelWithFeatures, PotentialWithFeatures};
 pub use potential_file::PotentialFileError;
 pub use setfl::EamStyle;
 pub use stillinger_weber::StillingerWeber;
+pub use wall::{Wall, WallSettings};
 pub use zbl::{Zbl, ZblRangeError};
 pub use zbl_windows::{RadiiWindows, ZblWindow, ZblWindows};

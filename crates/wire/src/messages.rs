@@ -68,22 +68,25 @@ pub enum DeclineReason {
     UnlikelyToComplete,
     /// It cannot be graded, or the mixture cannot be updated with it, or it is a control frame with atoms too close.
     LeftOut,
+    /// Its grade under the original mixture is above the bound of the guard.
+    GradeTooLarge,
 }
 
 impl DeclineReason {
     /// All reasons, in the order of summaries.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 8] = [
         Self::Covered,
         Self::Duplicate,
         Self::TooClose,
         Self::Budget,
         Self::Backlog,
         Self::UnlikelyToComplete,
+        Self::GradeTooLarge,
         Self::LeftOut,
     ];
 
-    /// The serialized name: `"covered"`, `"duplicate"`, `"too_close"`, `"budget"`, `"backlog"`, `"unlikely_to_complete"`
-    /// or `"left_out"`.
+    /// The serialized name: `"covered"`, `"duplicate"`, `"too_close"`, `"budget"`, `"backlog"`, `"unlikely_to_complete"`,
+    /// `"grade_too_large"` or `"left_out"`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Covered => "covered",
@@ -93,6 +96,7 @@ impl DeclineReason {
             Self::Backlog => "backlog",
             Self::UnlikelyToComplete => "unlikely_to_complete",
             Self::LeftOut => "left_out",
+            Self::GradeTooLarge => "grade_too_large",
         }
     }
 }

@@ -21,8 +21,8 @@ pub struct DecisionDetails {
     pub round: u64,
     /// `accepted`, `declined` or `control`.
     pub kind: String,
-    /// Why it was declined: `covered`, `duplicate`, `too_close`, `budget`, `backlog` or
-    /// `unlikely_to_complete`.
+    /// Why it was declined: `covered`, `duplicate`, `too_close`, `budget`, `backlog`,
+    /// `unlikely_to_complete` or `grade_too_large`.
     pub reason: Option<String>,
     /// Factor by which a long label queue had raised the threshold.
     pub raised_by: Option<f64>,

@@ -76,6 +76,8 @@ pub struct StructureSummary {
     pub periodic: [bool; 3],
     /// Å³. `None` without a cell.
     pub volume: Option<f64>,
+    /// Sets of atoms that bonds join ([`atoms::fragments`]). `None` if its distances cannot be measured.
+    pub fragments: Option<usize>,
     /// BLAKE3 hash of species, positions, cell and periodicity.
     pub hash: String,
 }
@@ -173,6 +175,7 @@ impl StructureSummary {
             elements,
             periodic: structure.periodic,
             volume: Some(structure.cell.volume()).filter(|volume| *volume > 0.0),
+            fragments: atoms::fragments(structure).ok(),
             hash: content.to_string(),
         }
     }

@@ -50,6 +50,7 @@ pub fn settings(threshold: f64) -> SelectorSettings {
         control: false,
         control_share: 0.5,
         min_distances: MinDistanceRule::Uniform(Uniform::default()),
+        max_grade: None,
         declined_feature_bytes: 1_000_000_000,
         version: Default::default(),
         refit_at: None,

@@ -96,7 +96,15 @@ impl DecisionState {
         };
         let returned = report.progress.segment > walk.state.segment;
         walk.state.segment = walk.state.segment.max(report.progress.segment);
-        if !matches!(report.outcome, Outcome::Ended(WalkEnd::InvalidStart { .. })) {
+        let made_no_step = match report.outcome {
+            Outcome::Ended(WalkEnd::InvalidStart { .. }) => true,
+            // It cannot go on from its checkpoint, which may not even be readable.
+            Outcome::Ended(WalkEnd::Diverged { .. }) => {
+                walk.record.checkpoint.as_ref() == Some(&report.checkpoint)
+            }
+            _ => false,
+        };
+        if !made_no_step {
             walk.record.checkpoint = Some(report.checkpoint.clone());
             walk.record.progress = report.progress.clone();
         }
@@ -292,7 +300,9 @@ impl DecisionState {
         {
             Some(DeclineReason::Backlog)
         } else {
-            None
+            // The walker has tested the grade under its own mixture, which sinks with updates.
+            let is_too_large = |bound| maximum(&graded.original.gamma) > bound;
+            self.settings.max_grade.is_some_and(is_too_large).then_some(DeclineReason::GradeTooLarge)
         }
     }
 

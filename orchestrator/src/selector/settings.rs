@@ -100,6 +100,8 @@ pub struct SelectorSettings {
     pub control_share: f64,
     /// How close atoms may come. Structures with closer atoms are declined.
     pub min_distances: MinDistanceRule,
+    /// γ_max under the original mixture above which candidates are declined.
+    pub max_grade: Option<f64>,
     /// Maximum size of the stored feature vectors of declined candidates, bytes.
     pub declined_feature_bytes: u64,
     /// The version of the potential in force. Every walk of the plan starts anew with each version.

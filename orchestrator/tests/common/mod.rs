@@ -101,6 +101,7 @@ pub fn settings(mode: CampaignMode) -> SelectorSettings {
         control: false,
         control_share: 0.5,
         min_distances: MinDistanceRule::Uniform(Uniform::default()),
+        max_grade: None,
         declined_feature_bytes: 1 << 20,
         version: Default::default(),
         refit_at: None,

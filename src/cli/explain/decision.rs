@@ -48,6 +48,7 @@ fn describe(reason: &str) -> &'static str {
         "budget" => "its seed structure or the campaign has reached its limit",
         "backlog" => "new, but below the raised threshold",
         "unlikely_to_complete" => "its label would probably fail (collect.min_completion_probability)",
+        "grade_too_large" => "its grade under the original mixture is above guard.max_grade",
         _ => "",
     }
 }

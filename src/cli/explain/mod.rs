@@ -126,10 +126,12 @@ fn shortened_list<T: AsRef<str>>(names: impl ExactSizeIterator<Item = T>) -> Str
 }
 
 fn write_structure(out: &mut dyn Write, structure: &StructureSummary) -> io::Result<()> {
-    let StructureSummary { formula, atoms, volume, hash, .. } = structure;
+    let StructureSummary { formula, atoms, volume, fragments, hash, .. } = structure;
     let volume = volume
         .map_or(String::new(), |volume| format!(", {volume:.2} Å³ ({:.3} Å³/atom)", volume / *atoms as f64));
-    line(out, "structure", &format!("{formula}, {}{volume}; content {}", count(*atoms, "atom"), &hash[..16]))
+    let fragments = fragments.map_or(String::new(), |number| format!(", {}", count(number, "fragment")));
+    let atoms = count(*atoms, "atom");
+    line(out, "structure", &format!("{formula}, {atoms}{volume}{fragments}; content {}", &hash[..16]))
 }
 
 fn write_found(out: &mut dyn Write, found: &Discovery) -> io::Result<()> {

@@ -1,15 +1,19 @@
 //! `calmwalk export`
 
+mod draw;
 mod split;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
+use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use atoms::extxyz::{Frame, LabelKeys, write_frame};
 use store::records::Protocol;
-use store::{DATABASE, ExportCursor, ExportFilter, ExportSource, JobState, LOCK, Store};
+use store::{DATABASE, ExportCursor, ExportFilter, ExportRow, ExportSource, JobState, LOCK, Store};
+use wire::{WalkConditions, WalkId};
 
+use self::draw::{Drawn, WalkDraw};
 use self::split::Shares;
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
@@ -59,7 +63,8 @@ pub struct ExportArgs {
     /// Combine comparisons with and, or, not and parentheses. A comparison with a missing value is false.
     ///
     /// Numbers of the structure (= != < <= > >=): gamma and gamma_nbr (largest of its atoms, original mixture), relative_volume (V/V₀),
-    /// kinetic_temperature (K), atoms, mixture_version (after the decision). Of its walk: walk, step, temperature (K), tau, version (of the
+    /// kinetic_temperature (K), atoms, fragments (sets of atoms that bonds join),
+    /// mixture_version (after the decision). Of its walk: walk, step, temperature (K), tau, version (of the
     /// potential). Of its label: energy (eV), energy_per_atom (eV), max_force (eV/Å).
     ///
     /// Texts (= !=): element (any atom of the structure), origin (biased, control or imported), seed_structure (its name, in quotes if it
@@ -67,6 +72,14 @@ pub struct ExportArgs {
     /// failures, such as other_moments).
     #[arg(long = "where", value_name = "FILTER")]
     condition: Option<StructureFilter>,
+    /// Export at most N structures of each walk, drawn at random from those that match --where
+    ///
+    /// Biased and control walks count by themselves; imported structures are not drawn. A larger N keeps what a smaller one draws.
+    #[arg(long, value_name = "N")]
+    per_walk: Option<NonZeroUsize>,
+    /// Random seed of the draw
+    #[arg(long, value_name = "N", default_value_t = 0, requires = "per_walk")]
+    draw_rng_seed: u64,
     /// Split into several files, such as train=0.9,test=0.1 for FILE-train and FILE-test
     ///
     /// Assigns the seed structures to the files at random, in these proportions. All structures found from one seed structure go to the
@@ -109,6 +122,8 @@ struct Exported {
     labels: store::LabelJobCounts,
     /// Structures with labels of other protocols, which are not exported.
     others: u64,
+    /// With `--per-walk`.
+    drawn: Option<Drawn>,
 }
 
 /// A file to write.
@@ -147,7 +162,7 @@ async fn check_completeness(
 
 impl ExportArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
-        let Exported { counts, labels, others } = block_on(self.export())??;
+        let Exported { counts, labels, others, drawn } = block_on(self.export())??;
         for (path, count, _) in &counts {
             if matches!(self.keys, KeyNames::Grace) && (1..count.frames).contains(&count.without_stress) {
                 let (without, frames, path) = (count.without_stress, count.frames, path.display());
@@ -167,6 +182,9 @@ impl ExportArgs {
                     )
                 };
                 writeln!(out, "{} in {}{from}", output::count(count.frames, "structure"), path.display())?;
+            }
+            if let Some(drawn) = &drawn {
+                drawn.write(out)?;
             }
             if others > 0 {
                 let others = output::count(others, "structure");
@@ -209,6 +227,7 @@ impl ExportArgs {
         let (filter, campaign) = (self.filter(&protocol), store.campaign().await?.id.to_string());
         let (mut parts, assigned) = self.parts(&store).await?;
         let conditions = store.walk_conditions().await?;
+        let drawn = self.draw(&store, &filter, &conditions).await?;
         let mut missing = store.labelled_cursors(&filter).await?;
         let (mut frames, mut last, bar) = (0, None, Bar::new(None, BAR));
         loop {
@@ -217,11 +236,8 @@ impl ExportArgs {
             last = Some(row.cursor);
             for row in page {
                 missing.remove(&row.cursor);
-                if self
-                    .condition
-                    .as_ref()
-                    .is_some_and(|condition| !condition.matches(&export_frame::facts(&row, &conditions)))
-                {
+                let is_drawn = drawn.as_ref().is_none_or(|drawn| drawn.has(&row));
+                if !is_drawn || !self.matches(&row, &conditions) {
                     continue;
                 }
                 frames += 1;
@@ -251,7 +267,30 @@ impl ExportArgs {
             jobs.filter(|(name, state, _)| *name != protocol.name && *state == JobState::Labelled);
         let others = by_others.map(|(.., count)| count).sum();
         store.close().await;
-        Ok(Exported { counts, labels, others })
+        Ok(Exported { counts, labels, others, drawn })
+    }
+
+    /// Whether a structure matches `--where`.
+    fn matches(&self, row: &ExportRow, conditions: &BTreeMap<WalkId, WalkConditions>) -> bool {
+        let matches = |condition: &StructureFilter| condition.matches(&export_frame::facts(row, conditions));
+        self.condition.as_ref().is_none_or(matches)
+    }
+
+    /// Draws structures of each walk, in a first read of all of them.
+    async fn draw(
+        &self,
+        store: &Store,
+        filter: &ExportFilter,
+        conditions: &BTreeMap<WalkId, WalkConditions>,
+    ) -> Result<Option<Drawn>, CommandError> {
+        let Some(per_walk) = self.per_walk else { return Ok(None) };
+        let (mut draw, mut last) = (WalkDraw::new(per_walk, self.draw_rng_seed), None);
+        loop {
+            let page = store.labelled(filter, last, PAGE).await?;
+            let Some(row) = page.last() else { return Ok(Some(draw.finish())) };
+            last = Some(row.cursor);
+            page.iter().filter(|row| self.matches(row, conditions)).for_each(|row| draw.offer(row));
+        }
     }
 
     /// The files to write, and the index of the file of each seed structure.

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use atoms::{Potential, extxyz::Frame, read_structures};
 use calm::rules::Positive;
-use md::ThermostatSettings;
+use md::{BarostatSettings, ThermostatSettings};
 use potentials::grace::Threads;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
@@ -14,7 +14,7 @@ use toml::Spanned;
 use crate::cli::CommandError;
 use crate::config::{
     ConfigError, Document, KnownKeys, PotentialConfig, PotentialSection, PythonSection, location_of_offset,
-    read_text, wrong_thermostat,
+    read_text, wrong_barostat, wrong_thermostat,
 };
 use crate::loaded_model::LoadedModel;
 use crate::output::log_and_warn;
@@ -68,6 +68,8 @@ pub struct DynamicsSection {
     pub rng_seed: u64,
     /// `{ none = {} }` for constant energy, or a thermostat.
     pub thermostat: ThermostatSettings,
+    /// Constant pressure. Default: the cell is fixed.
+    pub barostat: Option<BarostatSettings>,
     /// Skin of the neighbour list, Å; does not affect results.
     #[serde(default = "skin")]
     pub skin: Positive,
@@ -132,7 +134,12 @@ impl MdConfig {
                 known.join(", ")
             ));
         }
-        Ok(start)
+        let DynamicsSection { temperature, thermostat, barostat, .. } = &self.dynamics;
+        let fault = |it: &BarostatSettings| it.fault(temperature.get(), thermostat, &start.structure);
+        match barostat.as_ref().and_then(fault) {
+            Some(fault) => Err(format!("{at}: dynamics.barostat: {fault}")),
+            None => Ok(start),
+        }
     }
 }
 
@@ -153,8 +160,12 @@ fn read<P: DeserializeOwned>(
     let config: Option<MdFile<P>> = document.read(&format!("{PLACEHOLDERS}{potential}\n"), known);
     let warnings = document.check_ranges("dynamics");
     document.check_rules(|| {
-        let thermostat = config.as_ref().map(|config| config.dynamics.thermostat);
-        thermostat.and_then(|it| wrong_thermostat(&it, "dynamics")).into_iter().collect()
+        let dynamics = config.as_ref().map(|config| &config.dynamics);
+        let wrong = |it: &DynamicsSection| {
+            let barostat = it.barostat.and_then(|barostat| wrong_barostat(&barostat, "dynamics"));
+            wrong_thermostat(&it.thermostat, "dynamics").or(barostat)
+        };
+        dynamics.and_then(wrong).into_iter().collect()
     });
     document.finish()?;
     warnings.iter().for_each(log_and_warn);

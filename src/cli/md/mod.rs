@@ -8,7 +8,8 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use atoms::Potential;
-use md::{CellMotion, Dynamics, DynamicsSettings, State, Stream, default_time_step};
+use atoms::units::GPA_PER_EV_A3;
+use md::{Dynamics, DynamicsSettings, State, Stream, default_time_step};
 
 use self::config::{DynamicsSection, MdConfig, OutputSection};
 use self::trajectory::{Trajectory, time};
@@ -23,7 +24,8 @@ const BAR: &str = "{bar:32} {pos}/{len} steps  {eta} left  {msg}";
 ///
 /// Writes an extended XYZ trajectory with energy (eV), forces (eV/Å), stress (eV/Å³, tension positive, without the kinetic
 /// part), momenta (in the units of ASE), step, time_fs and temperature (K; 3n − 3 degrees of freedom if the momentum is
-/// conserved, 3n with Langevin). On Ctrl-C or SIGTERM, writes the last step and exits.
+/// conserved, 3n with Langevin). With dynamics.barostat, the lines of progress have the pressure (GPa, that of the atoms'
+/// motion included) and the volume relative to that at the start. On Ctrl-C or SIGTERM, writes the last step and exits.
 #[derive(Debug, clap::Args)]
 pub struct MdArgs {
     /// Configuration (TOML): structure, [potential], [dynamics], [output]; see configs/md-aluminium.toml
@@ -52,7 +54,7 @@ impl MdArgs {
         let stopping = signals::stop_token()?;
         let mut trajectory = Trajectory::create(&path)?;
         let started = Instant::now();
-        let progress = MdProgress::new(&config);
+        let progress = MdProgress::new(&config, &dynamics);
         let outcome = integrate(&mut dynamics, &mut *potential, config.dynamics.steps, |dynamics| {
             progress.update(dynamics);
             if dynamics.state().step.is_multiple_of(config.output.every.get()) {
@@ -87,10 +89,13 @@ fn initial_state(dynamics: &DynamicsSection, structure: atoms::Structure) -> Sta
 
 fn settings(dynamics: &DynamicsSection, state: &State) -> DynamicsSettings {
     let default = default_time_step(&state.structure.species);
+    let temperature = dynamics.temperature.get();
+    let thermostat = dynamics.thermostat.start(temperature);
+    let barostat = dynamics.barostat.map(|it| it.start(temperature, &thermostat, &state.structure));
     DynamicsSettings {
         time_step: dynamics.time_step.map_or(default, |time_step| time_step.get()),
-        thermostat: dynamics.thermostat.start(dynamics.temperature.get()),
-        cell_motion: CellMotion::Fixed,
+        thermostat,
+        cell_motion: barostat.into(),
         stream: Stream::new(dynamics.rng_seed, 0, 0),
         skin: dynamics.skin.get(),
     }
@@ -113,19 +118,22 @@ fn integrate(
 /// Reports progress: with a bar on a terminal, otherwise with lines.
 struct MdProgress {
     every: u64,
+    /// With a barostat: volume at the start, Å³.
+    volume: Option<f64>,
     bar: Option<Bar>,
 }
 
 impl MdProgress {
-    fn new(config: &MdConfig) -> Self {
+    fn new(config: &MdConfig, start: &Dynamics) -> Self {
         let OutputSection { every, log_every, .. } = config.output;
+        let volume = config.dynamics.barostat.map(|_| md::extent(start.structure()));
         let bar = std::io::stderr().is_terminal().then(|| Bar::new(Some(config.dynamics.steps), BAR));
+        let titles = ["step", "time (ps)", "energy (eV)", "temperature (K)", "conserved (eV)"];
         if bar.is_none() {
-            print_row(
-                ["step", "time (ps)", "energy (eV)", "temperature (K)", "conserved (eV)"].map(str::to_owned),
-            );
+            let of_cell: &[_] = if volume.is_some() { &["pressure (GPa)", "volume/first"] } else { &[] };
+            print_row(titles.iter().chain(of_cell).map(|title| (*title).to_owned()));
         }
-        Self { every: log_every.unwrap_or(every).get(), bar }
+        Self { every: log_every.unwrap_or(every).get(), volume, bar }
     }
 
     fn update(&self, dynamics: &Dynamics) {
@@ -133,19 +141,27 @@ impl MdProgress {
         if let Some(bar) = &self.bar {
             bar.set(step, || format!("{:.0} K", dynamics.temperature()));
         } else if step.is_multiple_of(self.every) {
-            print_row([
+            let mut row = vec![
                 step.to_string(),
                 format!("{:.3}", time(dynamics) / 1000.0),
                 format!("{:.6}", dynamics.evaluation().energy()),
                 format!("{:.1}", dynamics.temperature()),
                 decimals(dynamics.conserved_energy(), 6),
-            ]);
+            ];
+            if let Some(volume) = self.volume {
+                let pressure = dynamics.pressure_tensor();
+                let mean = pressure.map(|p| GPA_PER_EV_A3 * (p[0][0] + p[1][1] + p[2][2]) / 3.0);
+                row.push(decimals(mean, 3));
+                row.push(format!("{:.4}", md::extent(dynamics.structure()) / volume));
+            }
+            print_row(row.into_iter());
         }
     }
 }
 
 /// Prints a row to standard error, ignoring errors.
-fn print_row([step, time, energy, temperature, conserved]: [String; 5]) {
-    let mut out = std::io::stderr().lock();
-    let _ = writeln!(out, "{step:>10}  {time:>10}  {energy:>16}  {temperature:>15}  {conserved:>16}");
+fn print_row(columns: impl Iterator<Item = String>) {
+    const WIDTHS: [usize; 7] = [10, 10, 16, 15, 16, 14, 12];
+    let columns = columns.zip(WIDTHS).map(|(text, width)| format!("{text:>width$}"));
+    let _ = writeln!(std::io::stderr().lock(), "{}", columns.collect::<Vec<_>>().join("  "));
 }

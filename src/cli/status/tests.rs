@@ -148,6 +148,7 @@ fn status() -> CampaignStatus {
         budget: 100,
         backlog: 10_000,
         unlikely_to_complete: 0,
+        grade_too_large: 0,
     };
     CampaignStatus {
         walkers_busy: Some(0.625),

@@ -28,11 +28,12 @@ pub const UNKNOWN_QUANTITIES: [&[&str]; 3] = [
         "energy",
         "energy_per_atom",
         "max_force",
+        "fragments",
         "retry_adjustment",
         "element",
     ],
-    &["mixture_version", "energy", "energy_per_atom", "max_force", "retry_adjustment"],
-    &["energy", "energy_per_atom", "max_force", "retry_adjustment"],
+    &["mixture_version", "energy", "energy_per_atom", "max_force", "fragments", "retry_adjustment"],
+    &["energy", "energy_per_atom", "max_force", "fragments", "retry_adjustment"],
 ];
 
 /// The entries of walks that match the filter. `run_active`: whether an orchestrator runs.

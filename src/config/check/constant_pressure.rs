@@ -1,9 +1,8 @@
 //! Rules of walks at constant pressure.
 
 use calm::rules::Positive;
-use md::WrongSetting;
 
-use super::wrong;
+use super::{wrong, wrong_barostat};
 use crate::config::error::InvalidValue;
 use crate::config::{CellBiasSection, Config, WalkGroupSection, ranges};
 
@@ -15,8 +14,8 @@ pub(super) fn check_constant_pressure(config: &Config) -> Result<(), InvalidValu
             let expected = "either walk.barostat or walk.volume_ramp: a cell follows a pressure or a ramp";
             return wrong("walk.volume_ramp", "given together with walk.barostat", expected);
         }
-        if let Some(WrongSetting { key, found, expected }) = barostat.wrong() {
-            return wrong(&format!("walk.barostat.{key}"), found, expected);
+        if let Some(invalid) = wrong_barostat(barostat, "walk") {
+            return Err(invalid);
         }
         check_each("walk.barostat.stress", "walk.barostat.pressure", barostat.stress)?;
     }

@@ -23,7 +23,7 @@ pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
         "Candidates of biased walks (n = {}). a, By decision of the selector: accepted, or declined because the newest mixture \
          covered them (another walk had found a similar structure), as duplicates, because atoms were too close, because \
          the quota was reached (budget), because too many labels were queued (backlog), or because their labels would probably \
-         fail (unlikely to complete). The walkers’ guards rejected {} more \
+         fail (unlikely to complete), or because they were beyond guard.max_grade (grade too large). The walkers’ guards rejected {} more \
          structures before they became candidates. b, Accepted structures against candidates in the order of the decisions; \
          dashed, every candidate accepted. The flatter the line, the fewer new structures the walks find.",
         grouped(candidates.seen),
@@ -44,6 +44,9 @@ fn draw_fates(figure: &mut Figure, numbers: &mut Csv, place: ::figures::Rectangl
     ];
     if declined.unlikely_to_complete > 0 {
         fates.insert(0, ("unlikely to complete", declined.unlikely_to_complete));
+    }
+    if declined.grade_too_large > 0 {
+        fates.insert(0, ("grade too large", declined.grade_too_large));
     }
     let names: Vec<_> = fates.iter().map(|(name, _)| (*name).to_owned()).collect();
     let largest = fates.iter().map(|(_, count)| *count).max().unwrap_or(0).max(1) as f64;

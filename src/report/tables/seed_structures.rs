@@ -27,9 +27,12 @@ pub fn seed_structures(data: &ReportData) -> PageTable {
         "labelled",
         "failed",
     ];
-    // Most campaigns decline nothing for this reason.
-    let has_unlikely = data.status.candidates.declined.unlikely_to_complete > 0;
+    // Most campaigns decline nothing for these reasons.
+    let declined = &data.status.candidates.declined;
+    let has_unlikely = declined.unlikely_to_complete > 0;
+    let has_too_large = declined.grade_too_large > 0;
     titles.extend(has_unlikely.then_some("unlikely to complete"));
+    titles.extend(has_too_large.then_some("grade too large"));
     let mut table = PageTable::new("seed-structures", caption, &titles);
     let mut fates: BTreeMap<u64, BTreeMap<&str, u64>> = BTreeMap::new();
     for fate in &data.fates_by_seed_structure {
@@ -45,12 +48,13 @@ pub fn seed_structures(data: &ReportData) -> PageTable {
             states(walks_by_seed_structure.get(seed.name.as_str()).into_iter().flatten().copied());
         let names = ["accepted", "covered", "duplicate", "too_close", "budget", "backlog"];
         let mut row = vec![text(&seed.name), text(seed.structure.formula()), count(walks), text(ended)];
-        let unlikely = fate("unlikely_to_complete");
-        row.push(count(names.iter().map(|name| fate(name)).sum::<u64>() + unlikely));
+        let (unlikely, too_large) = (fate("unlikely_to_complete"), fate("grade_too_large"));
+        row.push(count(names.iter().map(|name| fate(name)).sum::<u64>() + unlikely + too_large));
         row.extend(names.map(|name| count(fate(name))));
         row.extend([count(control.structures), count(biased.labelled + control.labelled)]);
         row.push(count(biased.failed + control.failed));
         row.extend(has_unlikely.then(|| count(unlikely)));
+        row.extend(has_too_large.then(|| count(too_large)));
         table.rows.push(row);
     }
     table

@@ -215,6 +215,8 @@ fn properties<'a>(
         energy: row.energy,
         max_force: row.max_force,
         retry_adjustments: row.retry_adjustments.as_deref(),
+        // The list has no positions.
+        fragments: None,
         species,
         origin: &row.origin,
         seed_structure: Some(&row.seed_structure),

@@ -16,6 +16,7 @@ export const FATES = {
   budget: { colour: "#cc79a7", shape: "cross" },
   backlog: { colour: "#0072b2", shape: "plus" },
   unlikely_to_complete: { colour: "#7a5c3d", shape: "cross" },
+  grade_too_large: { colour: "#7a5c3d", shape: "triangle" },
   control: { colour: "#8a8f98", shape: "ring" },
 };
 

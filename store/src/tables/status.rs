@@ -183,6 +183,7 @@ fn candidates(fates: &[(String, String, u64)], rejected_by_guards: u64) -> Candi
             "budget" => declined.budget += count,
             "backlog" => declined.backlog += count,
             "unlikely_to_complete" => declined.unlikely_to_complete += count,
+            "grade_too_large" => declined.grade_too_large += count,
             _ => {}
         }
     }

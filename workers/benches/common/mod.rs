@@ -5,14 +5,26 @@ use std::time::Instant;
 
 use atoms::{Cell, MinDistanceRule, Species, Structure, Uniform};
 use calm::Mixture;
-use md::{BarostatSettings, LangevinSettings, ThermostatSettings};
+use md::{BarostatSettings, LangevinSettings, NoseHooverSettings, ThermostatSettings};
 use potentials::grace::{GraceModel, Threads};
 use potentials::{ZblWindow, ZblWindows};
 use wire::messages::{Assignment, AssignmentReport, Outcome};
-use wire::{CampaignId, Candidate, Origin, WalkConditions, WalkId};
+use wire::{CampaignId, Candidate, ConstantPressure, Origin, WalkConditions, WalkId};
 use workers::cell_bias::CellBiasSettings;
 use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
+
+/// What the cell of a walk does.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Ensemble {
+    /// The integrator of a volume ramp that goes nowhere, with Langevin dynamics.
+    ConstantVolume,
+    /// 1 bar, fully flexible, with Nosé–Hoover chains.
+    ConstantPressure {
+        /// Whether the cell is biased too.
+        cell_bias: bool,
+    },
+}
 
 /// An assignment of a walk with active bias, which starts at the same checkpoint each time.
 #[derive(Clone)]
@@ -25,13 +37,18 @@ pub struct TimedWalk {
 }
 
 impl TimedWalk {
-    pub fn new(model: &Arc<GraceModel>, mixture: &Arc<Mixture>, seed_structure: Structure) -> Self {
+    pub fn new(
+        model: &Arc<GraceModel>,
+        mixture: &Arc<Mixture>,
+        seed_structure: Structure,
+        ensemble: Ensemble,
+    ) -> Self {
         let context = |threshold| WalkContext {
             model: model.clone(),
             threads: Threads::default(),
-            settings: Arc::new(settings(threshold)),
+            settings: Arc::new(settings(threshold, ensemble)),
         };
-        let mut assignment = assignment(seed_structure, u64::MAX);
+        let mut assignment = assignment(seed_structure, ensemble, u64::MAX);
         // Any structure is a candidate from the first permitted step on.
         let report = run(&context(1e-9), &assignment, mixture);
         let Outcome::Candidate(candidate) = report.outcome else {
@@ -67,19 +84,25 @@ fn run(
 
 const EQUILIBRATION: u64 = 100;
 
-/// Settings of the aluminium campaign at constant volume, so that every call has as many bonds. A structure is a
+/// Settings of the aluminium campaign; at constant volume every call has as many bonds. A structure is a
 /// candidate if its largest grade is above `threshold`.
-fn settings(threshold: f64) -> WalkSettings {
+fn settings(threshold: f64, ensemble: Ensemble) -> WalkSettings {
+    let chain = NoseHooverSettings { relaxation_time: 100.0, chain_length: 3 };
+    // 75.9 GPa in eV/Å³, the paper's for aluminium.
+    let cell_bias = CellBiasSettings { stress_scale: Some(0.474), ..CellBiasSettings::default() };
     WalkSettings {
         rng_seed: 3,
-        thermostat: ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 }),
+        thermostat: match ensemble {
+            Ensemble::ConstantVolume => ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 }),
+            Ensemble::ConstantPressure { .. } => ThermostatSettings::NoseHoover(chain),
+        },
         time_step: None,
         equilibration_steps: EQUILIBRATION,
         biased_steps: 10_000_000,
         bias_averaging_steps: 10,
         barostat: BarostatSettings::default(),
         reference_steps: 0,
-        cell_bias: CellBiasSettings::default(),
+        cell_bias,
         remove_update_work: false,
         trace_interval: 50,
         skin: 0.5,
@@ -88,6 +111,7 @@ fn settings(threshold: f64) -> WalkSettings {
         min_interval: 200,
         min_interval_after_decline: 20,
         zbl: Some(ZblWindows::Uniform(ZblWindow { inner: 1.6, outer: 2.4 })),
+        wall: None,
         guard: GuardSettings {
             min_distances: MinDistanceRule::Uniform(Uniform { min_distance: 1.2, fraction: 0.5 }),
             max_grade: None,
@@ -101,7 +125,13 @@ fn settings(threshold: f64) -> WalkSettings {
     }
 }
 
-fn assignment(seed_structure: Structure, until: u64) -> Assignment {
+fn assignment(seed_structure: Structure, ensemble: Ensemble, until: u64) -> Assignment {
+    let (volume_ramp, constant_pressure) = match ensemble {
+        Ensemble::ConstantVolume => (Some((1.0, 1.0)), None),
+        Ensemble::ConstantPressure { cell_bias } => {
+            (None, Some(ConstantPressure { pressure: 1.0, start_volume: 1.0, cell_bias }))
+        }
+    };
     Assignment {
         campaign: CampaignId([1; 16]),
         walk: WalkId(0),
@@ -112,7 +142,8 @@ fn assignment(seed_structure: Structure, until: u64) -> Assignment {
         conditions: WalkConditions {
             temperature: 600.0,
             tau: 0.15,
-            volume_ramp: Some((1.0, 1.0)),
+            volume_ramp,
+            constant_pressure,
             ..WalkConditions::default()
         },
         checkpoint: None,

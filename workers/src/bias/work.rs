@@ -21,4 +21,10 @@ impl BiasWork {
         self.total += 0.5 * time_step * (self.power + power);
         self.power = power;
     }
+
+    /// Takes note that the velocities were multiplied by `factor`, which changed the kinetic energy by `energy`, eV.
+    pub fn velocities_scaled(&mut self, factor: f64, energy: f64) {
+        self.total += energy;
+        self.power *= factor;
+    }
 }

@@ -3,11 +3,11 @@
 
 use atoms::Structure;
 use md::{CellMotion, Dynamics, Stream};
-use serde::{Deserialize, Serialize};
 use wire::messages::{Assignment, Outcome, WalkProgress};
 use wire::{Candidate, ConstantPressure, ContentHash, Origin};
 
-use super::state::{WalkState, run_settings, start_dynamics};
+use super::initial_dynamics::{run_settings, start_dynamics};
+use super::state::WalkState;
 use super::{RunningWalk, WalkError};
 use crate::bias::BiasedPotential;
 use crate::cell_bias::CellBias;
@@ -15,16 +15,6 @@ use crate::settings::WalkSettings;
 
 /// Segment of the random numbers of reference runs. Those of walks count from 0.
 const REFERENCE_SEGMENT: u32 = u32::MAX;
-
-/// An unbiased run at constant pressure before the first step of a walk. V₀ is its mean volume over the second half, and
-/// its last structure, scaled, is that from which the walk starts (paper, Methods).
-///
-/// It depends on seed structure, temperature and pressure only, so walks that differ otherwise have the same V₀.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct ReferenceRun {
-    /// Sum of the volumes after the steps of the second half.
-    volumes: f64,
-}
 
 /// Starts the reference run of a walk that has one.
 pub(super) fn start_reference_run(
@@ -87,14 +77,18 @@ pub(super) fn cell_bias(
 }
 
 impl RunningWalk<'_> {
-    /// Runs what is left of the reference run, at most as many steps as the assignment has, and puts the walk at its start.
+    /// Runs what is left of the reference run, at most as many steps as the assignment has, and puts the walk at its start. An
+    /// assignment that was interrupted goes on to the same step.
     pub(super) fn finish_reference_run(
         &mut self,
         stopping: &impl Fn() -> bool,
         on_progress: &impl Fn(WalkProgress),
     ) -> Result<Option<Outcome<Candidate>>, WalkError> {
         let steps = self.settings.reference_steps;
-        let last_step = self.dynamics.state().step.saturating_add(self.assignment.last_step);
+        let (number, begun) = (self.assignment.number, self.dynamics.state().step);
+        if let Some(run) = self.state.reference_run.as_mut().filter(|run| run.assignment != number) {
+            (run.assignment, run.until) = (number, begun.saturating_add(self.assignment.last_step));
+        }
         while let Some(mut run) = self.state.reference_run {
             let step = self.dynamics.state().step;
             if step >= steps {
@@ -102,7 +96,7 @@ impl RunningWalk<'_> {
                 self.start_from_reference(volume)?;
                 break;
             }
-            if step >= last_step {
+            if step >= run.until {
                 return Ok(Some(Outcome::StepsDone));
             }
             if stopping() {
@@ -170,7 +164,7 @@ impl RunningWalk<'_> {
     pub(super) fn is_at_volume_boundary(&self) -> bool {
         let WalkState { cell_bias, collected, .. } = &self.state;
         let step = self.step();
-        cell_bias.as_ref().is_some_and(|bias| bias.ends(&self.settings.cell_bias, step, collected.len()))
+        cell_bias.as_ref().is_some_and(|bias| bias.ends(&self.settings.cell_bias, step, *collected))
     }
 
     fn cell_motion(&self) -> &CellMotion {

@@ -1,13 +1,9 @@
-//! The state of a walk between assignments, and its initial state.
+//! The state of a walk between assignments.
 
-use atoms::{MinDistances, NeighbourList, Potential, ShortestDistances, Structure};
-use md::{CellMotion, Checkpoint, Dynamics, State, Stream, VolumeRamp};
+use atoms::MinDistances;
+use md::{Checkpoint, Dynamics};
 use serde::{Deserialize, Serialize};
-use wire::Origin;
-use wire::messages::Assignment;
 
-use super::constant_pressure::{ReferenceRun, cell_bias, start_reference_run};
-use super::error::WalkError;
 use crate::bias::{BiasState, BiasedPotential};
 use crate::cell_bias::CellBias;
 use crate::settings::WalkSettings;
@@ -37,8 +33,10 @@ pub(super) struct WalkState {
     pub max_consecutive_rejections: u32,
     /// First step at which a candidate may be offered.
     pub next_offer: u64,
-    /// Points at which structures were collected.
-    pub collected: Vec<CollectionPoint>,
+    /// Number of collected structures.
+    pub collected: u64,
+    /// The points of collections that a roll back could still count from.
+    pub collection_points: Vec<CollectionPoint>,
     /// How close atoms may come.
     pub min_distances: MinDistances,
     /// Targets of roll backs, oldest first.
@@ -46,6 +44,20 @@ pub(super) struct WalkState {
     pub gamma_max: f64,
     /// Number of points of the trace so far.
     pub trace_points: u64,
+}
+
+/// An unbiased run at constant pressure before the first step of a walk. V₀ is its mean volume over the second half, and
+/// its last structure, scaled, is that from which the walk starts (paper, Methods).
+///
+/// It depends on seed structure, temperature and pressure only, so walks that differ otherwise have the same V₀.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct ReferenceRun {
+    /// Sum of the volumes after the steps of the second half.
+    pub volumes: f64,
+    /// Number of the assignment that last worked on it.
+    pub assignment: u64,
+    /// The step of the run at which that assignment ends, however often it is interrupted.
+    pub until: u64,
 }
 
 /// A state to which a walk can roll back.
@@ -79,102 +91,31 @@ impl WalkState {
         GoodState { dynamics: dynamics.checkpoint().clone(), bias: potential.state, cell_bias }
     }
 
+    /// Counts a structure that was collected at `step`, and forgets the points that no roll back can count from: those whose
+    /// interval is over at the oldest target of roll backs, which never becomes older.
+    pub fn collect(&mut self, step: u64, settings: &WalkSettings) {
+        self.collected += 1;
+        let oldest = self.good.first().map_or(0, |good| good.dynamics.state.step);
+        self.collection_points.retain(|point| point.next_offer(settings) > oldest);
+        self.collection_points.push(CollectionPoint { branch: step, beyond: 0 });
+    }
+
     /// The first step at which a candidate may be offered after a roll back to `step`. The interval to a collection
     /// counts along the path that joins the two: back from the collection along the abandoned piece, then forward
     /// again.
     pub fn offer_after_rollback(&mut self, step: u64, settings: &WalkSettings) -> u64 {
-        for collected in self.collected.iter_mut().filter(|collected| collected.branch > step) {
-            collected.beyond += collected.branch - step;
-            collected.branch = step;
+        for point in self.collection_points.iter_mut().filter(|point| point.branch > step) {
+            point.beyond += point.branch - step;
+            point.branch = step;
         }
-        let offers = self.collected.iter().map(|c| c.branch + settings.min_interval.saturating_sub(c.beyond));
+        let offers = self.collection_points.iter().map(|point| point.next_offer(settings));
         offers.max().unwrap_or(0).max(step + settings.min_interval_after_decline)
     }
 }
 
-/// Starts a walk: at its seed structure with thermal velocities, or with its reference run.
-pub(super) fn start(
-    settings: &WalkSettings,
-    assignment: &Assignment,
-    potential: &mut BiasedPotential,
-) -> Result<(Dynamics, WalkState), WalkError> {
-    let (structure, conditions) = (&assignment.seed_structure, &assignment.conditions);
-    let mut neighbours = NeighbourList::new(potential.cutoff(), 0.0);
-    neighbours.update(structure)?;
-    let min_distances =
-        settings.guard.min_distances.limits(&ShortestDistances::from_neighbours(structure, &neighbours));
-    let reference_volume = md::extent(structure);
-    let cell_bias = cell_bias(settings, assignment, potential)?;
-    let reference = start_reference_run(settings, assignment, potential)?;
-    let reference_run = reference.as_ref().map(|_| ReferenceRun::default());
-    let dynamics = match reference {
-        Some(dynamics) => dynamics,
-        None => start_dynamics(settings, assignment, structure.clone(), reference_volume, potential)?,
-    };
-    let mut state = WalkState {
-        dynamics: dynamics.checkpoint().clone(),
-        bias: BiasState::default(),
-        reference_run,
-        reference_volume,
-        cell_bias,
-        bias_sum: None,
-        tau: if assignment.origin == Origin::Control { 0.0 } else { conditions.tau },
-        segment: 0,
-        rollbacks: 0,
-        last_rollback: None,
-        rejected: 0,
-        max_consecutive_rejections: 0,
-        next_offer: 0,
-        collected: Vec::new(),
-        min_distances,
-        good: Vec::new(),
-        gamma_max: 0.0,
-        trace_points: 0,
-    };
-    state.keep_checkpoint(&dynamics, potential);
-    Ok((dynamics, state))
-}
-
-/// The first state of a walk: `structure` with thermal velocities, at the volume at which the walk starts. V₀ in Å³
-/// (Å² for a slab, Å for a wire).
-pub(super) fn start_dynamics(
-    settings: &WalkSettings,
-    assignment: &Assignment,
-    structure: Structure,
-    reference_volume: f64,
-    potential: &mut BiasedPotential,
-) -> Result<Dynamics, WalkError> {
-    let conditions = &assignment.conditions;
-    let stream = Stream::new(settings.rng_seed, assignment.random_walk.0, 0);
-    let mut start = State::thermal(structure, conditions.temperature, &stream);
-    let ramp = conditions.volume_ramp.map(|(from, to)| {
-        let ramp = VolumeRamp::new(&start, from, to, settings.biased_steps);
-        VolumeRamp { start: settings.equilibration_steps, ..ramp }
-    });
-    // Equilibration runs at the volume at which the ramp begins.
-    if let Some(ramp) = ramp.filter(|ramp| ramp.from != 1.0) {
-        ramp.apply(&mut start.structure, 0);
+impl CollectionPoint {
+    /// The step of the current path at which the interval to this collection is over.
+    fn next_offer(&self, settings: &WalkSettings) -> u64 {
+        self.branch + settings.min_interval.saturating_sub(self.beyond)
     }
-    // Likewise, the barostat moves the cell only afterwards.
-    if let Some(constant) = conditions.constant_pressure {
-        let ratio = constant.start_volume * reference_volume / md::extent(&start.structure);
-        if ratio != 1.0 {
-            md::scale_volume(&mut start.structure, ratio);
-        }
-    }
-    let run = run_settings(settings, assignment, ramp.into(), stream);
-    Ok(Dynamics::new(start, run, potential)?)
-}
-
-/// Settings of the dynamics of a walk.
-pub(super) fn run_settings(
-    settings: &WalkSettings,
-    assignment: &Assignment,
-    cell_motion: CellMotion,
-    stream: Stream,
-) -> md::DynamicsSettings {
-    let species = &assignment.seed_structure.species;
-    let time_step = settings.time_step.unwrap_or_else(|| md::default_time_step(species));
-    let thermostat = settings.thermostat.start(assignment.conditions.temperature);
-    md::DynamicsSettings { time_step, thermostat, cell_motion, stream, skin: settings.skin }
 }

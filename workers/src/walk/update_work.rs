@@ -39,8 +39,9 @@ impl RunningWalk<'_> {
         let thermal = md::thermal_energy(temperature, self.dynamics.degrees_of_freedom());
         let kept = (present - work).max(FLOOR * thermal);
         if kept < present {
-            self.dynamics.scale_velocities((kept / present).sqrt());
-            self.potential.state.work.total += kept - present;
+            let factor = (kept / present).sqrt();
+            self.dynamics.scale_velocities(factor);
+            self.potential.state.work.velocities_scaled(factor, kept - present);
         }
         Ok(())
     }

@@ -1,0 +1,108 @@
+//! A wall around a cluster.
+
+use atoms::{Evaluation, Structure, Vec3, cell};
+use serde::{Deserialize, Serialize};
+
+/// A wall around each cluster.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct WallSettings {
+    /// Distance of the wall from the farthest atom, Å.
+    pub margin: f64,
+    /// k, eV/Å².
+    pub stiffness: f64,
+}
+
+impl Default for WallSettings {
+    /// That of `grace_uq hal`.
+    fn default() -> Self {
+        Self { margin: 2.0, stiffness: 1.0 }
+    }
+}
+
+/// A sphere that holds atoms together: E = ½ k Σ max(0, |r − c| − R)². Energy in eV, lengths in Å. It has no virial, because a
+/// cluster has no volume.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Wall {
+    centre: Vec3,
+    radius: f64,
+    stiffness: f64,
+}
+
+impl Wall {
+    /// About the centre of mass of a cluster, beyond its farthest atom.
+    pub fn around(cluster: &Structure, settings: &WallSettings) -> Self {
+        let (mut centre, mut mass) = ([0.0; 3], 0.0);
+        for (r, species) in cluster.positions.iter().zip(&cluster.species) {
+            centre = cell::add(centre, cell::scale(*r, species.mass()));
+            mass += species.mass();
+        }
+        let centre = cell::scale(centre, 1.0 / mass);
+        let distances = cluster.positions.iter().map(|r| cell::norm(cell::sub(*r, centre)));
+        let farthest = distances.fold(0.0, f64::max);
+        Self { centre, radius: farthest + settings.margin, stiffness: settings.stiffness }
+    }
+
+    /// Adds energy and forces.
+    pub fn add(&self, structure: &Structure, out: &mut Evaluation) {
+        let results = out.atomic_energies.iter_mut().zip(&mut out.forces);
+        for (r, (energy, force)) in structure.positions.iter().zip(results) {
+            let from_centre = cell::sub(*r, self.centre);
+            let distance = cell::norm(from_centre);
+            let beyond = distance - self.radius;
+            if beyond > 0.0 {
+                *energy += 0.5 * self.stiffness * beyond * beyond;
+                *force = cell::add(*force, cell::scale(from_centre, -self.stiffness * beyond / distance));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use atoms::Cell;
+
+    fn cluster(positions: &[Vec3]) -> Structure {
+        Structure {
+            species: ["Al", "H", "Al"].map(|symbol| symbol.parse().unwrap()).to_vec(),
+            positions: positions.to_vec(),
+            cell: Cell([[0.0; 3]; 3]),
+            periodic: [false; 3],
+        }
+    }
+
+    #[test]
+    fn the_wall_pulls_back_what_has_left() {
+        let start = cluster(&[[1.0, 0.0, 0.0], [3.0, 4.0, 0.0], [5.0, 0.0, 0.0]]);
+        let wall = Wall::around(&start, &WallSettings { margin: 1.5, stiffness: 2.0 });
+        let [aluminium, _, _] = [0, 1, 2].map(|k: usize| start.species[k].mass());
+        let hydrogen = start.species[1].mass();
+        let y = 4.0 * hydrogen / (2.0 * aluminium + hydrogen);
+        assert!((wall.centre[0] - 3.0).abs() < 1e-12 && (wall.centre[1] - y).abs() < 1e-12, "{wall:?}");
+        assert!((wall.radius - (4.0 - y + 1.5)).abs() < 1e-12, "{wall:?}");
+        let evaluate = |structure: &Structure| {
+            let mut out = Evaluation::default();
+            out.reset(3);
+            wall.add(structure, &mut out);
+            out
+        };
+        assert_eq!(evaluate(&start).energy(), 0.0);
+        let left = cluster(&[[1.0, 0.0, 0.0], [3.0 + 4.0, 4.0 + y, 3.0], [-3.0, 1.0, 0.5]]);
+        let found = evaluate(&left);
+        let beyond = (4.0_f64 * 4.0 * 2.0 + 9.0).sqrt() - wall.radius;
+        assert!((found.atomic_energies[1] - beyond * beyond).abs() < 1e-12, "{found:?}");
+        assert_eq!(found.atomic_energies[0], 0.0);
+        // Forces are the derivative of the energy.
+        for atom in 0..3 {
+            for axis in 0..3 {
+                let energy = |shift: f64| {
+                    let mut moved = left.clone();
+                    moved.positions[atom][axis] += shift;
+                    evaluate(&moved).energy()
+                };
+                let slope = (energy(1e-5) - energy(-1e-5)) / 2e-5;
+                assert!((found.forces[atom][axis] + slope).abs() < 1e-8, "{atom} {axis}");
+            }
+        }
+    }
+}
