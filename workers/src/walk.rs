@@ -7,6 +7,7 @@ mod candidate;
 mod constant_pressure;
 mod error;
 mod state;
+mod step_view;
 mod trace;
 mod update_work;
 
@@ -17,7 +18,9 @@ use calm::{CollectionRule, Mixture};
 use md::{Dynamics, Stream};
 use potentials::grace::Threads;
 use potentials::{ModelWithFeatures, Zbl};
-use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd, WalkProgress};
+use wire::messages::{
+    Assignment, AssignmentReport, AssignmentStart, Outcome, Verdict, WalkEnd, WalkProgress,
+};
 use wire::{Candidate, Origin, TracePoint};
 
 use crate::bias::{BiasedPotential, UngradedError};
@@ -26,6 +29,7 @@ use crate::guard;
 use crate::settings::WalkSettings;
 use error::WalkError;
 use state::{CollectionPoint, GoodState, WalkState, start};
+pub use step_view::StepView;
 
 /// Data shared by every walk of a campaign.
 #[derive(Clone)]
@@ -50,6 +54,21 @@ pub fn advance(
     stopping: impl Fn() -> bool,
     on_progress: impl Fn(WalkProgress),
 ) -> Result<AssignmentReport<Candidate>, PotentialUnavailable> {
+    advance_observed(context, assignment, mixture, stopping, on_progress, |_| ())
+}
+
+/// Like [`advance`], and calls `on_step` at the start of the walk and after each of its steps.
+///
+/// # Errors
+/// See [`advance`].
+pub fn advance_observed(
+    context: &WalkContext,
+    assignment: &Assignment,
+    mixture: Arc<Mixture>,
+    stopping: impl Fn() -> bool,
+    on_progress: impl Fn(WalkProgress),
+    mut on_step: impl FnMut(&mut StepView<'_, '_>),
+) -> Result<AssignmentReport<Candidate>, PotentialUnavailable> {
     let (walk, number) = (assignment.walk, assignment.number);
     let mut running = match RunningWalk::start_or_resume(context, assignment, mixture) {
         Ok(running) => running,
@@ -60,6 +79,7 @@ pub fn advance(
             return Ok(AssignmentReport {
                 walk,
                 assignment: number,
+                start: None,
                 outcome: Outcome::Ended(end),
                 checkpoint,
                 progress: WalkProgress::default(),
@@ -67,7 +87,13 @@ pub fn advance(
             });
         }
     };
-    let outcome = match running.run(&stopping, &on_progress) {
+    let start = AssignmentStart {
+        position: running.progress().position(),
+        mixture_version: running.mixture_version,
+        threshold_factor: assignment.threshold_factor,
+        verdict: assignment.verdict.clone(),
+    };
+    let outcome = match running.run(&stopping, &on_progress, &mut on_step) {
         Ok(outcome) => outcome,
         Err(WalkError::Unavailable(reason)) => return Err(PotentialUnavailable(reason)),
         Err(error) => Outcome::Ended(WalkEnd::Diverged { reason: format!("{}: {error}", running.place()) }),
@@ -75,6 +101,7 @@ pub fn advance(
     Ok(AssignmentReport {
         walk,
         assignment: number,
+        start: Some(start),
         outcome,
         checkpoint: running.encode(),
         progress: running.progress(),
@@ -163,9 +190,14 @@ impl<'a> RunningWalk<'a> {
         &mut self,
         stopping: &impl Fn() -> bool,
         on_progress: &impl Fn(WalkProgress),
+        on_step: &mut impl FnMut(&mut StepView<'_, '_>),
     ) -> Result<Outcome<Candidate>, WalkError> {
+        let begins = self.assignment.checkpoint.is_none() || self.state.reference_run.is_some();
         if let Some(interrupted) = self.finish_reference_run(stopping, on_progress)? {
             return Ok(interrupted);
+        }
+        if begins {
+            on_step(&mut StepView { walk: self });
         }
         let last = self.settings.equilibration_steps + self.settings.biased_steps;
         loop {
@@ -183,6 +215,7 @@ impl<'a> RunningWalk<'a> {
             }
             self.advance_one_step()?;
             self.trace_step()?;
+            on_step(&mut StepView { walk: self });
             if let Some(outcome) = self.inspect_step()? {
                 return Ok(outcome);
             }
@@ -334,6 +367,8 @@ impl<'a> RunningWalk<'a> {
             rejected: self.state.rejected,
             rollbacks: self.state.rollbacks,
             last_rollback: self.state.last_rollback,
+            reference_step: self.reference_step(),
+            reference_volume: self.reference_volume(),
         }
     }
 

@@ -92,6 +92,7 @@ fn crash_report(work: &WorkItem) -> AssignmentReport<Candidate> {
     AssignmentReport {
         walk: work.assignment.walk,
         assignment: work.assignment.number,
+        start: None,
         outcome: Outcome::Ended(end),
         checkpoint: work.assignment.checkpoint.clone().unwrap_or_default(),
         progress: WalkProgress::default(),
