@@ -162,7 +162,7 @@ function budget(status) {
 function stateOf(walk, isRunning) {
   if (walk.paused) return "paused";
   if (!isRunning && walk.state === "running") return "stopped";
-  return walk.reference_step == null ? walk.state : "reference run";
+  return walk.reference_step == null ? walk.state : "reference_run";
 }
 
 /** `changed` is called after walks were paused or resumed; false if they cannot be. */
