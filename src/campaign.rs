@@ -300,36 +300,7 @@ impl LoadedCampaign {
 
     /// The part of the configuration that walks need.
     pub fn walk_settings(&self) -> WalkSettings {
-        let Config { campaign, walk, collect, guard, .. } = &self.config;
-        WalkSettings {
-            rng_seed: campaign.rng_seed,
-            thermostat: walk.thermostat,
-            time_step: walk.time_step.map(|dt| dt.get()),
-            equilibration_steps: walk.equilibration_steps,
-            biased_steps: walk.biased_steps.get(),
-            bias_averaging_steps: walk.bias_averaging_steps.get(),
-            barostat: walk.barostat.unwrap_or_default(),
-            reference_steps: walk.reference_steps,
-            cell_bias: walk.cell_bias.unwrap_or_default().settings(),
-            trace_interval: walk.trace_interval,
-            remove_update_work: walk.remove_update_work,
-            skin: walk.skin.get(),
-            collection: collect.criterion,
-            min_interval: collect.min_interval,
-            min_interval_after_decline: collect.min_interval_after_decline.get(),
-            zbl: guard.zbl.clone(),
-            wall: guard.wall.map(|wall| wall.settings()),
-            guard: GuardSettings {
-                min_distances: guard.min_distances.clone(),
-                max_grade: guard.max_grade.map(|grade| grade.get()),
-                max_temperature: guard.max_temperature.get(),
-                rollback: guard.rollback,
-                max_consecutive_rejections: guard.max_consecutive_rejections.get(),
-                max_rollbacks: guard.max_rollbacks,
-                tau_factor: guard.tau_factor.get(),
-                checkpoint_interval: guard.checkpoint_interval.get(),
-            },
-        }
+        walk_settings(&self.config)
     }
 
     /// The part of the configuration that the selector needs.
@@ -371,6 +342,40 @@ pub fn grader(model: &LoadedModel) -> Grader {
     let n = model.elements().len();
     let cutoffs = (0..n * n).map(|k| model.pair_cutoff(k / n, k % n)).collect();
     Grader::new(model.elements().to_vec(), cutoffs)
+}
+
+/// The part of a configuration that walks need.
+pub fn walk_settings(config: &Config) -> WalkSettings {
+    let Config { campaign, walk, collect, guard, .. } = config;
+    WalkSettings {
+        rng_seed: campaign.rng_seed,
+        thermostat: walk.thermostat,
+        time_step: walk.time_step.map(|dt| dt.get()),
+        equilibration_steps: walk.equilibration_steps,
+        biased_steps: walk.biased_steps.get(),
+        bias_averaging_steps: walk.bias_averaging_steps.get(),
+        barostat: walk.barostat.unwrap_or_default(),
+        reference_steps: walk.reference_steps,
+        cell_bias: walk.cell_bias.unwrap_or_default().settings(),
+        trace_interval: walk.trace_interval,
+        remove_update_work: walk.remove_update_work,
+        skin: walk.skin.get(),
+        collection: collect.criterion,
+        min_interval: collect.min_interval,
+        min_interval_after_decline: collect.min_interval_after_decline.get(),
+        zbl: guard.zbl.clone(),
+        wall: guard.wall.map(|wall| wall.settings()),
+        guard: GuardSettings {
+            min_distances: guard.min_distances.clone(),
+            max_grade: guard.max_grade.map(|grade| grade.get()),
+            max_temperature: guard.max_temperature.get(),
+            rollback: guard.rollback,
+            max_consecutive_rejections: guard.max_consecutive_rejections.get(),
+            max_rollbacks: guard.max_rollbacks,
+            tau_factor: guard.tau_factor.get(),
+            checkpoint_interval: guard.checkpoint_interval.get(),
+        },
+    }
 }
 
 /// The part of a configuration that the selector needs.

@@ -17,6 +17,8 @@ const EMPTY_DATABASE_BYTES: u64 = 500_000;
 const CHECKPOINT_BYTES_PER_ATOM: u64 = 450;
 /// A point of the trace of a walk, bytes.
 const POINT_BYTES: u64 = 152;
+/// The record of an assignment of a walk, bytes.
+const ASSIGNMENT_BYTES: u64 = 100;
 /// Largest size of SQLite's write-ahead log, bytes.
 pub const WAL_BYTES: u64 = 70_000_000;
 
@@ -32,8 +34,8 @@ pub fn estimate(campaign: &LoadedCampaign) -> DiskForecast {
         config.collect.max_structures.map_or(collected, |total| collected.min(total.get().into()));
     let copies = if config.campaign.control { 2 } else { 1 };
     let mean = seeds().map(|atoms| structure_bytes(atoms, features)).sum::<u64>() / number.max(1);
-    let trace = trace_bytes(config);
-    let walk = |atoms| CHECKPOINT_BYTES_PER_ATOM * atoms + HALF_PAGE_BYTES + trace;
+    let records = trace_bytes(config) + assignment_bytes(config);
+    let walk = |atoms| CHECKPOINT_BYTES_PER_ATOM * atoms + HALF_PAGE_BYTES + records;
     let walks = seeds().zip(walks()).map(|(atoms, walks)| walks as u64 * walk(atoms)).sum::<u64>();
     let mixture: usize =
         campaign.artifact.mixture.iter().map(|(.., component)| component.to_bytes().len()).sum();
@@ -45,10 +47,18 @@ pub fn estimate(campaign: &LoadedCampaign) -> DiskForecast {
     }
 }
 
+fn steps(config: &Config) -> u64 {
+    config.walk.equilibration_steps.saturating_add(config.walk.biased_steps.get())
+}
+
+/// The records of the assignments of a walk that makes all its steps. Those that end with a candidate are negligible beside it.
+fn assignment_bytes(config: &Config) -> u64 {
+    ASSIGNMENT_BYTES * (steps(config) / config.run.steps_per_assignment.get())
+}
+
 /// The trace of a walk that makes all its steps.
 fn trace_bytes(config: &Config) -> u64 {
-    let steps = config.walk.equilibration_steps.saturating_add(config.walk.biased_steps.get());
-    match steps.checked_div(config.walk.trace_interval) {
+    match steps(config).checked_div(config.walk.trace_interval) {
         Some(points) => {
             POINT_BYTES * points.saturating_add(1).min(MAX_KEPT_POINTS as u64 + 1) + HALF_PAGE_BYTES
         }

@@ -147,6 +147,11 @@ fn walks_at_constant_pressure_give_the_same_bytes_for_any_number_of_walkers() {
     let pressed = json!({ "pressure": 50000.0, "start_volume": 1.0, "cell_bias": false });
     let expected = [driven(0.97), driven(1.05), driven(0.97), driven(1.05), pressed];
     assert_eq!(walks.iter().map(|walk| constant(walk)).collect::<Vec<_>>(), expected);
+    // V₀ is that of the reference run: the same for the walks from one seed structure at one pressure, whatever their start.
+    let volumes: Vec<_> = walks.iter().map(|walk| walk["reference_volume"].as_f64().unwrap()).collect();
+    assert_eq!((volumes[0], volumes[2]), (volumes[1], volumes[3]));
+    assert!(volumes[4] < volumes[3] && volumes[4] > 0.5 * volumes[3], "{volumes:?}");
+    assert!(walks.iter().all(|walk| walk["reference_step"].is_null()));
     let text = succeed(here, ["status", "campaign", "--walks", "50"]);
     assert!(text.contains("vacancy (driven, 1 bar from V 1.05, biased cell)"), "{text}");
     assert!(succeed(here, ["replay", "campaign"]).contains("all reproduced bit by bit"));

@@ -53,6 +53,7 @@ mod refit;
 mod refit_campaigns;
 mod relabel;
 mod replay;
+mod rerun;
 mod scheduling;
 mod schema;
 mod select;

@@ -31,7 +31,9 @@ impl ExpectedEnd {
         // A walk at constant pressure counts no steps before the end of its reference run.
         let reference = |walk: &WalkStatus| {
             let constant = walk.conditions.as_ref().is_some_and(|walk| walk.constant_pressure.is_some());
-            if constant && walk.step == 0 { steps("reference_steps") } else { 0 }
+            let is_left = constant && walk.step == 0 && walk.reference_volume.is_none();
+            let made = walk.reference_step.unwrap_or_default();
+            if is_left { steps("reference_steps").saturating_sub(made) } else { 0 }
         };
         let left = |walk: &WalkStatus| reference(walk) + steps_per_walk.saturating_sub(walk.step);
         let left: u64 = under_way.map(left).sum();
@@ -73,6 +75,25 @@ mod tests {
             json!({ "walk": { "equilibration_steps": 1_000, "biased_steps": 19_000 } }),
             QueueCost::default(),
         )
+    }
+
+    #[test]
+    fn steps_of_a_reference_run_are_left_until_they_are_made() {
+        let (mut status, mut configuration, queue) = campaign();
+        configuration["walk"]["reference_steps"] = json!(5_000);
+        let mut hours = |change: &dyn Fn(&mut WalkStatus)| {
+            change(&mut status.walks[1]);
+            ExpectedEnd::extrapolate(&status, &configuration, &queue).walks_hours.unwrap()
+        };
+        let constant_pressure =
+            Some(wire::conditions::ConstantPressure { pressure: 1.0, start_volume: 1.0, cell_bias: false });
+        let conditions = Some(wire::WalkConditions { constant_pressure, ..Default::default() });
+        let made = |steps: u64| 1.0 + (5_000 - steps) as f64 / 36_000.0;
+        assert!((hours(&|walk| walk.conditions.clone_from(&conditions)) - made(0)).abs() < 1e-12);
+        assert!((hours(&|walk| walk.reference_step = Some(3_200)) - made(3_200)).abs() < 1e-12);
+        let known =
+            |walk: &mut WalkStatus| (walk.reference_step, walk.reference_volume) = (None, Some(540.0));
+        assert!((hours(&known) - 1.0).abs() < 1e-12);
     }
 
     #[test]

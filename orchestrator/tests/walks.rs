@@ -3,8 +3,8 @@
 use orchestrator::selector::{
     CampaignMode, Scheduling, Selector, SelectorSettings, SelectorSnapshot, UpdateProtocol,
 };
-use store::records::{ComponentRecord, Fate};
-use wire::messages::{Assignment, AssignmentReport, Outcome, WalkEnd, WalkProgress};
+use store::records::{AssignmentRecord, ComponentRecord, Fate};
+use wire::messages::{Assignment, AssignmentReport, AssignmentStart, Outcome, WalkEnd, WalkProgress};
 use wire::{Origin, TracePoint, WalkId};
 
 use crate::common;
@@ -203,6 +203,74 @@ fn the_points_of_every_report_are_committed_with_it() {
     assert!(selector.report(traced(&second, Outcome::StepsDone, &[2])).unwrap().is_none());
     let commit = decided(&mut selector, traced(&first, Outcome::StepsDone, &[0]));
     assert_eq!(numbers(&commit), [(0, vec![0]), (1, vec![2])]);
+}
+
+/// What walkers began assignments with, and where these ended: with every report, in both modes.
+#[test]
+fn assignments_are_recorded_with_their_reports() {
+    let from = |assignment: &Assignment, outcome, steps: [u64; 2], mixture_version| AssignmentReport {
+        start: Some(AssignmentStart {
+            position: at(steps[0]).position(),
+            mixture_version,
+            threshold_factor: assignment.threshold_factor,
+            verdict: assignment.verdict.clone(),
+        }),
+        ..common::report(assignment, outcome, at(steps[1]))
+    };
+    let recorded = |commit: &store::records::Commit| -> Vec<[u64; 5]> {
+        let row = |one: &AssignmentRecord| {
+            let [begin, end] = [one.start.position.step, one.end.step];
+            [one.part, one.number, one.start.mixture_version, begin, end]
+        };
+        commit.assignments.iter().map(row).collect()
+    };
+    for mode in [CampaignMode::Live, CampaignMode::Reproducible] {
+        let mut store = MemoryStore::default();
+        let mut selector = restore(&settings(mode), 1, SelectorSnapshot::default());
+        store.commit(&selector.start_walks());
+        let assignment = next_assignment(&mut selector);
+        let commit = decided(&mut selector, from(&assignment, Outcome::Interrupted, [0, 4], 3));
+        assert_eq!(recorded(&commit), [[0, 0, 3, 0, 4]]);
+        store.commit(&commit);
+        // The numbers go on after a restart.
+        let mut selector = restore(&settings(mode), 1, store.snapshot());
+        let assignment = next_assignment(&mut selector);
+        let commit = decided(&mut selector, from(&assignment, Outcome::StepsDone, [4, 10], 5));
+        assert_eq!(recorded(&commit), [[1, 0, 5, 4, 10]]);
+        // A walker that made no step has nothing to record.
+        let assignment = next_assignment(&mut selector);
+        let commit = decided(&mut selector, common::report(&assignment, Outcome::Interrupted, at(10)));
+        assert_eq!(recorded(&commit), [[0; 5]; 0]);
+        let assignment = next_assignment(&mut selector);
+        let ended = Outcome::Ended(WalkEnd::Completed);
+        let commit = decided(&mut selector, from(&assignment, ended, [10, 20], 5));
+        assert_eq!(recorded(&commit), [[2, 1, 5, 10, 20]]);
+    }
+}
+
+/// Their records would not begin at the start of the walk.
+#[test]
+fn assignments_of_walks_of_earlier_versions_are_not_recorded() {
+    let mut store = MemoryStore::default();
+    let mut selector = restore(&settings(CampaignMode::Live), 1, SelectorSnapshot::default());
+    let mut commit = selector.start_walks();
+    for walk in &mut commit.walks {
+        let mut state: serde_json::Value = serde_json::from_str(&walk.selector_state).unwrap();
+        assert_eq!(state.as_object_mut().unwrap().remove("records"), Some(0.into()));
+        walk.selector_state = state.to_string();
+    }
+    store.commit(&commit);
+    let mut selector = restore(&settings(CampaignMode::Live), 1, store.snapshot());
+    let assignment = next_assignment(&mut selector);
+    let start = AssignmentStart {
+        position: at(0).position(),
+        mixture_version: 0,
+        threshold_factor: 1.0,
+        verdict: None,
+    };
+    let report =
+        AssignmentReport { start: Some(start), ..common::report(&assignment, Outcome::StepsDone, at(10)) };
+    assert!(decided(&mut selector, report).assignments.is_empty());
 }
 
 fn returned(segment: u32, step: u64) -> WalkProgress {

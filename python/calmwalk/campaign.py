@@ -192,7 +192,7 @@ class Campaign:
 
     def walks(self) -> Iterator[Walk]:
         """The walks, by number."""
-        names, conditions = self._seed_names, self._walk_conditions()
+        names, conditions, volumes = self._seed_names, self._walk_conditions(), self._reference_volumes()
         columns = [name for name, _ in checksums.WALK.columns] + ["checksum"]
         sql = f"SELECT {', '.join(columns)} FROM walk WHERE walk > ? ORDER BY walk LIMIT ?"
         kept = {field.name for field in fields(Walk)}
@@ -203,6 +203,7 @@ class Campaign:
                 **values,
                 seed_structure_name=names.get(row["seed_structure"], ""),
                 conditions=conditions.get(row["walk"]),
+                reference_volume=volumes.get(row["walk"]),
             )
 
     def walk_trace(self, walk: int) -> Trace:
@@ -380,6 +381,15 @@ class Campaign:
         for row in rows:
             checksums.SEED_STRUCTURE.verify(row)
         return {row["seed"]: row["name"] for row in rows}
+
+    def _reference_volumes(self) -> dict[int, float]:
+        """V₀ of the walks that have one; tables of earlier versions have none."""
+        found = {}
+        if self._store.schema >= 20:
+            for row in self._store.rows("SELECT * FROM reference_volume ORDER BY walk"):
+                checksums.REFERENCE_VOLUME.verify(row)
+                found[row["walk"]] = row["volume"]
+        return found
 
     def _walk_conditions(self) -> dict[int, WalkConditions]:
         """Those of all walks, which are added while a campaign runs."""

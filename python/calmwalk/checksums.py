@@ -100,6 +100,7 @@ WALK = _table(
 )
 WALK_CONDITIONS = _table("walk_conditions", "walk", "walk:i conditions:t")
 WALK_TRACE = _table("walk_trace", "walk", "walk:i points:i data:b")
+REFERENCE_VOLUME = _table("reference_volume", "walk", "walk:i volume:r")
 VERSION = _table(
     "version",
     "number",

@@ -166,6 +166,8 @@ class Walk:
     gamma_max: float | None
     rejected: int
     rollbacks: int
+    reference_volume: float | None = None
+    """V₀ of a walk at constant pressure from its first step on, Å³ (Å² for a slab, Å for a wire)."""
 
 
 @dataclass(frozen=True)

@@ -378,6 +378,21 @@ class DamageTests(CampaignCase):
             with self.assertRaisesRegex(DamagedError, "structure [0-9]+: its content"):
                 list(damaged.seed_structures())
 
+    def test_reference_volumes_are_verified(self) -> None:
+        from calmwalk import checksums
+
+        columns = checksums.REFERENCE_VOLUME.columns
+        right = checksums.checksum((kind, {"walk": 1, "volume": 540.25}[name]) for name, kind in columns)
+        self.change(f"INSERT INTO reference_volume VALUES (1, 540.25, {right})")
+        with calmwalk.open(self.copy) as campaign:
+            self.assertEqual([walk.reference_volume for walk in campaign.walks()][:3], [None, 540.25, None])
+        self.change("UPDATE reference_volume SET volume = 541")
+        with (
+            calmwalk.open(self.copy) as damaged,
+            self.assertRaisesRegex(DamagedError, "reference volume 1: its content"),
+        ):
+            list(damaged.walks())
+
     def test_nothing_is_written(self) -> None:
         before = self.file.read_bytes()
         with calmwalk.open(self.copy) as campaign:

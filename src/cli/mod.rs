@@ -27,6 +27,7 @@ mod refitter;
 mod relabel;
 mod replay;
 mod report;
+mod rerun;
 mod run;
 mod schema;
 mod seed_structure_table;
@@ -85,6 +86,7 @@ enum CliCommand {
     Export(export::ExportArgs),
     Report(report::ReportArgs),
     Replay(replay::ReplayArgs),
+    Rerun(rerun::RerunArgs),
     Versions(versions::VersionsArgs),
     Refit(refit::RefitArgs),
     #[command(subcommand)]
@@ -131,6 +133,7 @@ pub fn run(arguments: Arguments) -> Result<ExitStatus, CommandError> {
         CliCommand::Export(command) => command.run(),
         CliCommand::Report(command) => command.run(),
         CliCommand::Replay(command) => command.run(),
+        CliCommand::Rerun(command) => command.run(),
         CliCommand::Versions(command) => command.run(),
         CliCommand::Refit(command) => command.run(),
         CliCommand::Calm(command) => command.run(),

@@ -21,9 +21,10 @@ use crate::exit_status::CommandError;
 use crate::output::Bar;
 
 pub use overrides::RuleOverride;
+pub use relocated::find as find_files;
 pub use relocated::{ARTIFACT, MODEL, RelocatedFilesArgs, find_one};
 pub use report::{FateChange, FateCounts, MissingFeatures, ReplayReport};
-pub use version::mixture_of;
+pub use version::{MixtureStream, mixture_of};
 
 const BAR: &str = "{bar:32} {pos}/{len} decisions  {eta} left";
 
@@ -54,9 +55,14 @@ pub fn resolved(campaign: &store::CampaignRecord) -> Result<Value, CommandError>
         .map_err(|error| CommandError::Failed(format!("damaged database: the configuration: {error}")))
 }
 
+/// The configuration with which the campaign began.
+pub fn recorded_configuration(campaign: &store::CampaignRecord) -> Result<Config, CommandError> {
+    overrides::configuration(&campaign.configuration, &[])
+}
+
 /// The settings of the selector with which the campaign began.
 pub fn recorded_settings(campaign: &store::CampaignRecord) -> Result<SelectorSettings, CommandError> {
-    Ok(campaign::selector_settings(&overrides::configuration(&campaign.configuration, &[])?))
+    Ok(campaign::selector_settings(&recorded_configuration(campaign)?))
 }
 
 /// The selector's state before the first decision.

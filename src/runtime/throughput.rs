@@ -89,7 +89,9 @@ impl Throughput {
         match notice {
             Notice::Progress(walk, progress) => self.update(*walk, progress, now),
             Notice::Committed(commit) => {
-                let begun = commit.walks.iter().filter(|record| record.progress.step > 0);
+                let has_begun =
+                    |progress: &WalkProgress| progress.step > 0 || progress.reference_step.is_some();
+                let begun = commit.walks.iter().filter(|record| has_begun(&record.progress));
                 begun.for_each(|record| self.update(record.walk, &record.progress, now));
             }
             Notice::Walkers { busy, all } if *all > 0 => {
@@ -102,9 +104,11 @@ impl Throughput {
     fn update(&mut self, walk: WalkId, progress: &WalkProgress, now: i64) {
         let known = self.walks.contains_key(&walk.0);
         let entry = self.walks.entry(walk.0).or_default();
-        // The steps of earlier runs do not count, and neither does a rollback to a checkpoint.
-        if known && entry.record.segment == progress.segment {
-            let made = progress.step.saturating_sub(entry.record.step);
+        // The steps of earlier runs do not count, and neither does a rollback to a checkpoint, or the end of a reference run.
+        let before = (entry.record.segment, entry.record.reference_step.is_some());
+        if known && before == (progress.segment, progress.reference_step.is_some()) {
+            let from = entry.record.reference_step.unwrap_or(entry.record.step);
+            let made = progress.reference_step.unwrap_or(progress.step).saturating_sub(from);
             entry.steps += made;
             self.steps += made;
         }
@@ -114,6 +118,7 @@ impl Throughput {
             seen: now,
             segment: progress.segment,
             step: progress.step,
+            reference_step: progress.reference_step,
             steps_per_second: entry.speed.average,
             tau: Some(progress.tau),
             temperature: Some(progress.temperature),
@@ -182,6 +187,23 @@ mod tests {
         // All walkers are gone.
         throughput.notice(&Notice::Walkers { busy: 0, all: 0 }, 301_000);
         assert!(throughput.take_changes(302_000).1.walkers_busy.is_some());
+    }
+
+    #[test]
+    fn steps_of_a_reference_run_count_towards_the_speed() {
+        let mut throughput = Throughput::default();
+        throughput.take_changes(0);
+        let in_reference = |step| WalkProgress { reference_step: Some(step), ..at(0, 0) };
+        for (progress, now) in
+            [(in_reference(100), 0), (in_reference(300), 1000), (at(0, 10), 2000), (at(0, 210), 3000)]
+        {
+            throughput.notice(&Notice::Progress(WalkId(0), progress), now);
+            let reference_step = throughput.walks[&0].record.reference_step;
+            assert_eq!(reference_step.is_some(), now < 2000, "{now}");
+        }
+        let (changed, all) = throughput.take_changes(4000);
+        assert_eq!(all.steps_per_second, Some(100.0), "400 steps in 4 s");
+        assert_eq!((changed[0].step, changed[0].reference_step), (210, None));
     }
 
     #[test]

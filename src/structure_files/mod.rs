@@ -13,6 +13,8 @@ use atoms::Species;
 use atoms::extxyz::Frame;
 
 pub use self::arguments::{StructureArgs, StructureReadingArgs};
+#[cfg(test)]
+pub use self::format::Structures;
 pub use self::format::is_plain_extxyz;
 pub use self::reader::{FileLine, StructureReader};
 use crate::exit_status::CommandError;

@@ -115,6 +115,17 @@ pub static WALK_CONDITIONS: CheckedTable =
 pub static WALK_TRACE: CheckedTable =
     checked!("walk_trace" by walk Integer { walk: Integer, points: Integer, data: Bytes });
 
+/// Assignments of walks. Its messages name the walk.
+pub static ASSIGNMENT: CheckedTable = checked!("assignment" by walk Integer {
+    walk: Integer, part: Integer, number: Integer, mixture_version: Integer, threshold_factor: Real, verdict: Text,
+    start_segment: Integer, start_step: Integer, start_reference_step: Integer, segment: Integer, step: Integer,
+    reference_step: Integer,
+});
+
+/// V₀ of walks at constant pressure.
+pub static REFERENCE_VOLUME: CheckedTable =
+    checked!("reference_volume" by walk Integer { walk: Integer, volume: Real });
+
 /// Versions of the potential, which have never been without checksums. Their hashes cover their files.
 pub static VERSION: CheckedTable = checked!("version" by number Integer {
     number: Integer, parent: Integer, state: Text, reason: Text, method: Text, structures: Integer,

@@ -5,7 +5,7 @@ use std::fmt;
 use atoms::cell::norm;
 use atoms::{Matrix3, Structure, Vec3};
 use serde::{Deserialize, Serialize};
-use wire::messages::{DeclineReason, WalkProgress};
+use wire::messages::{AssignmentStart, DeclineReason, PathPosition, WalkProgress};
 use wire::{
     CampaignId, CandidateBlock, CandidateId, ContentHash, Origin, TracePoint, WalkConditions, WalkId,
 };
@@ -243,6 +243,23 @@ pub struct Commit {
     pub values: Vec<(String, String)>,
     /// New points of walks' traces, in order; a walk may have several entries.
     pub traces: Vec<(WalkId, Vec<TracePoint>)>,
+    /// Assignments of walks, in order.
+    pub assignments: Vec<AssignmentRecord>,
+}
+
+/// An assignment of a walk, or a part of one that was interrupted: with it, the walk can be run again.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AssignmentRecord {
+    /// The walk.
+    pub walk: WalkId,
+    /// Number of this record in the walk, from 0.
+    pub part: u64,
+    /// Number of the assignment. Parts of one that was interrupted have the same.
+    pub number: u64,
+    /// With what it began.
+    pub start: AssignmentStart,
+    /// Where it ended.
+    pub end: PathPosition,
 }
 
 /// A label: the result of a reference calculation for a structure.

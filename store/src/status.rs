@@ -124,6 +124,10 @@ pub struct WalkStatus {
     pub paused: bool,
     /// Step.
     pub step: u64,
+    /// Step of its reference run, as long as that lasts and its walker reports.
+    pub reference_step: Option<u64>,
+    /// V₀ of a walk at constant pressure from its first step on, Å³ (Å² for a slab, Å for a wire).
+    pub reference_volume: Option<f64>,
     /// Segment.
     pub segment: u32,
     /// τ.
@@ -156,6 +160,9 @@ impl FromRow for WalkStatus {
     fn from_row(row: &SqlRow) -> Result<Self> {
         WALK.verify(row, Names::Joined)?;
         Ok(Self {
+            // Other tables have them.
+            reference_step: None,
+            reference_volume: None,
             walk: row.get("walk")?,
             seed_structure: row.get("seed_structure")?,
             conditions: None,

@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::database::from_columns;
+use crate::database::{FromRow, SqlRow};
+use crate::error::Result;
 
 /// The last reported progress of a walk.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -15,6 +16,8 @@ pub struct WalkProgressRecord {
     pub segment: u32,
     /// Step.
     pub step: u64,
+    /// Step of the reference run, as long as it lasts.
+    pub reference_step: Option<u64>,
     /// Steps per second, including the time between assignments; `None` until it can be computed.
     pub steps_per_second: Option<f64>,
     /// τ.
@@ -36,14 +39,19 @@ pub struct TotalThroughput {
     pub walkers_busy: Option<f64>,
 }
 
-from_columns!(WalkProgressRecord {
-    walk,
-    seen,
-    segment,
-    step,
-    steps_per_second,
-    tau,
-    temperature,
-    relative_volume,
-    gamma_max
-});
+impl FromRow for WalkProgressRecord {
+    fn from_row(row: &SqlRow) -> Result<Self> {
+        Ok(Self {
+            walk: row.get("walk")?,
+            seen: row.get("seen")?,
+            segment: row.get("segment")?,
+            step: row.get("step")?,
+            reference_step: row.get_or_default("reference_step")?,
+            steps_per_second: row.get("steps_per_second")?,
+            tau: row.get("tau")?,
+            temperature: row.get("temperature")?,
+            relative_volume: row.get("relative_volume")?,
+            gamma_max: row.get("gamma_max")?,
+        })
+    }
+}

@@ -12,14 +12,15 @@ use store::{Commit, ComponentRecord, DATABASE, ExportFilter, Fate, Store, StoreE
 use wire::Origin;
 use wire::messages::DeclineReason;
 
+use crate::assignments::assignment;
 use crate::common::*;
 use crate::version_records::{version_files, version_record};
 use crate::walk_trace::trace_point;
 
 /// Columns whose bits are flipped: numbers of labels, structures, features, grades, decisions, the mixture, walks,
-/// archives, seed structures, imports, versions of the potential and traces of walks. Keys are left out: foreign keys and other rows
+/// archives, seed structures, imports, versions of the potential, traces and assignments of walks. Keys are left out: foreign keys and other rows
 /// check them.
-const COLUMNS: [(&str, &[&str]); 15] = [
+const COLUMNS: [(&str, &[&str]); 17] = [
     ("structure", &["hash", "atoms", "data", "checksum"]),
     ("seed_structure", &["structure", "checksum"]),
     ("protocol", &["hash", "checksum"]),
@@ -96,6 +97,22 @@ const COLUMNS: [(&str, &[&str]); 15] = [
     ),
     ("version_file", &["data"]),
     ("walk_trace", &["points", "data", "checksum"]),
+    (
+        "assignment",
+        &[
+            "number",
+            "mixture_version",
+            "threshold_factor",
+            "verdict",
+            "start_segment",
+            "start_step",
+            "segment",
+            "step",
+            "reference_step",
+            "checksum",
+        ],
+    ),
+    ("reference_volume", &["volume", "checksum"]),
 ];
 
 fn wanted(variable: &str, by_default: u64) -> u64 {
@@ -131,8 +148,10 @@ async fn full(directory: &Path, accepted: u64) -> Store {
         walks[1].accepted = 0;
         let components = vec![ComponentRecord { element: 0, slot: 1, bytes: step.to_le_bytes().repeat(20) }];
         let values = vec![("round".to_owned(), step.to_string())];
+        walks[0].progress.reference_volume = Some(540.25);
         let traces = vec![(walks[0].walk, vec![trace_point(step - 1)])];
-        store.commit(&Commit { walks, components, values, traces, ..commit_of(records) }).await.unwrap();
+        let (assignments, rest) = (vec![assignment(0, step - 1)], commit_of(records));
+        store.commit(&Commit { walks, components, values, traces, assignments, ..rest }).await.unwrap();
     }
     for number in 0..accepted * 3 / 4 {
         let lease = store.lease(protocol("dft").hash, "l", 0, 600).await.unwrap().unwrap();
@@ -165,6 +184,7 @@ async fn flip(connection: &mut SqliteConnection, random: &mut Random) -> Option<
     let keys = match table {
         "component" => "element || ',' || slot",
         "archive" => "job || ',' || attempt",
+        "assignment" => "walk || ',' || part",
         "value" => "name",
         _ => "rowid",
     };
@@ -375,7 +395,8 @@ async fn a_database_of_an_earlier_version_gets_checksums() {
 /// Turns it into a database of version 8 by undoing what later versions add and rename.
 async fn without_checksums(directory: &Path) {
     let mut connection = connect(directory).await;
-    let mut sql = "DROP TABLE walk_trace; DROP INDEX job_order; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
+    let mut sql = "DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
+    DROP TABLE walk_trace; DROP INDEX job_order; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
         CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
         DROP TABLE version_file; DROP TABLE version;
         DROP TABLE walk_conditions; DROP TRIGGER label_has_checksum; DROP INDEX label_excluded;

@@ -2,6 +2,7 @@
 
 mod common;
 
+mod assignments;
 mod backup;
 mod budget;
 mod campaign;

@@ -9,6 +9,7 @@ mod error;
 mod initial_dynamics;
 mod start;
 mod state;
+mod step_view;
 mod trace;
 mod update_work;
 
@@ -19,7 +20,9 @@ use calm::{CollectionRule, Mixture};
 use md::{Dynamics, Stream};
 use potentials::grace::Threads;
 use potentials::{ModelWithFeatures, Wall, Zbl};
-use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd, WalkProgress};
+use wire::messages::{
+    Assignment, AssignmentReport, AssignmentStart, Outcome, Verdict, WalkEnd, WalkProgress,
+};
 use wire::{Candidate, Origin, TracePoint};
 
 use crate::bias::{BiasedPotential, UngradedError};
@@ -29,6 +32,7 @@ use crate::settings::WalkSettings;
 use error::WalkError;
 use start::start;
 use state::{GoodState, WalkState};
+pub use step_view::StepView;
 
 /// Data shared by every walk of a campaign.
 #[derive(Clone)]
@@ -53,12 +57,33 @@ pub fn advance(
     stopping: impl Fn() -> bool,
     on_progress: impl Fn(WalkProgress),
 ) -> Result<AssignmentReport<Candidate>, PotentialUnavailable> {
+    advance_observed(context, assignment, mixture, stopping, on_progress, |_| ())
+}
+
+/// Like [`advance`], and calls `on_step` at the start of the walk and after each of its steps.
+///
+/// # Errors
+/// See [`advance`].
+pub fn advance_observed(
+    context: &WalkContext,
+    assignment: &Assignment,
+    mixture: Arc<Mixture>,
+    stopping: impl Fn() -> bool,
+    on_progress: impl Fn(WalkProgress),
+    mut on_step: impl FnMut(&mut StepView<'_, '_>),
+) -> Result<AssignmentReport<Candidate>, PotentialUnavailable> {
     let mut running = match RunningWalk::start_or_resume(context, assignment, mixture) {
         Ok(running) => running,
         Err(WalkError::Unavailable(reason)) => return Err(PotentialUnavailable(reason)),
         Err(error) => return Ok(without_a_step(assignment, error.to_string())),
     };
-    let outcome = match running.run(&stopping, &on_progress) {
+    let start = AssignmentStart {
+        position: running.progress().position(),
+        mixture_version: running.mixture_version,
+        threshold_factor: assignment.threshold_factor,
+        verdict: assignment.verdict.clone(),
+    };
+    let outcome = match running.run(&stopping, &on_progress, &mut on_step) {
         Ok(outcome) => outcome,
         Err(WalkError::Unavailable(reason)) => return Err(PotentialUnavailable(reason)),
         Err(error) => Outcome::Ended(WalkEnd::Diverged { reason: format!("{}: {error}", running.place()) }),
@@ -66,6 +91,7 @@ pub fn advance(
     Ok(AssignmentReport {
         walk: assignment.walk,
         assignment: assignment.number,
+        start: Some(start),
         outcome,
         checkpoint: running.encode(),
         progress: running.progress(),
@@ -82,6 +108,7 @@ pub(crate) fn without_a_step(assignment: &Assignment, reason: String) -> Assignm
     AssignmentReport {
         walk: assignment.walk,
         assignment: assignment.number,
+        start: None,
         outcome: Outcome::Ended(end),
         checkpoint: assignment.checkpoint.clone().unwrap_or_default(),
         progress: WalkProgress::default(),
@@ -176,10 +203,15 @@ impl<'a> RunningWalk<'a> {
         &mut self,
         stopping: &impl Fn() -> bool,
         on_progress: &impl Fn(WalkProgress),
+        on_step: &mut impl FnMut(&mut StepView<'_, '_>),
     ) -> Result<Outcome<Candidate>, WalkError> {
+        let begins = self.assignment.checkpoint.is_none() || self.state.reference_run.is_some();
         self.begin()?;
         if let Some(interrupted) = self.finish_reference_run(stopping, on_progress)? {
             return Ok(interrupted);
+        }
+        if begins {
+            on_step(&mut StepView { walk: self });
         }
         let last = self.settings.equilibration_steps + self.settings.biased_steps;
         loop {
@@ -197,6 +229,7 @@ impl<'a> RunningWalk<'a> {
             }
             self.advance_one_step()?;
             self.trace_step()?;
+            on_step(&mut StepView { walk: self });
             if let Some(outcome) = self.inspect_step()? {
                 return Ok(outcome);
             }
@@ -348,6 +381,8 @@ impl<'a> RunningWalk<'a> {
             rejected: self.state.rejected,
             rollbacks: self.state.rollbacks,
             last_rollback: self.state.last_rollback,
+            reference_step: self.reference_step(),
+            reference_volume: self.reference_volume(),
         }
     }
 

@@ -93,6 +93,11 @@ impl Column {
         Self { width: 3, entries: ColumnData::Real(vectors.concat()) }
     }
 
+    /// A column of numbers, `[n]`.
+    pub fn scalars(numbers: &[f64]) -> Self {
+        Self { width: 1, entries: ColumnData::Real(numbers.to_vec()) }
+    }
+
     /// The values as reals, if they are numbers.
     pub fn reals(&self) -> Option<Vec<f64>> {
         match &self.entries {

@@ -1,4 +1,4 @@
-//! Reads text dumps of LAMMPS (`dump atom` and `dump custom`), snapshot by snapshot.
+//! Reads and writes text dumps of LAMMPS (`dump atom` and `dump custom`), snapshot by snapshot.
 //!
 //! The format: docs.lammps.org/dump.html. Orthogonal, triclinic and general triclinic boxes; coordinates `x`, `xu`, `xs` and
 //! `xsu`. Atoms are in the order of their `id`, since LAMMPS writes them in any order. Binary and other dump styles are not read.
@@ -7,6 +7,7 @@
 
 mod error;
 mod sections;
+mod write;
 
 use std::io::{BufRead, ErrorKind};
 
@@ -17,6 +18,7 @@ use crate::structure::Structure;
 
 pub use error::{DumpError, DumpErrorKind};
 use sections::{DumpAtom, DumpColumns, SimulationBox};
+pub use write::{DumpSnapshot, write_snapshot};
 
 /// Iterates over the snapshots of a stream. Ends after the first error.
 ///

@@ -101,8 +101,8 @@ fn walk(door: &ConnectInfo) {
             let outcome = Outcome::Candidate(candidate.clone());
             let checkpoint = vec![0; CHECKPOINT];
             let progress = WalkProgress::default();
-            let (walk, assignment, trace) = (WalkId(0), trip as u64, Vec::new());
-            let report = AssignmentReport { walk, assignment, outcome, checkpoint, progress, trace };
+            let (walk, assignment, trace, start) = (WalkId(0), trip as u64, Vec::new(), None);
+            let report = AssignmentReport { walk, assignment, start, outcome, checkpoint, progress, trace };
             let (begin, encoding) = (Instant::now(), walker.encoding());
             let work = walker.exchange(Some(report)).expect("an assignment");
             let (whole, encode) = (begin.elapsed(), walker.encoding() - encoding);

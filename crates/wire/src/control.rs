@@ -17,11 +17,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::block::CandidateBlock;
 use crate::ids::{CandidateId, Origin, WalkId};
-use crate::messages::{Assignment, AssignmentReport, Outcome, WalkEnd, WalkProgress};
+use crate::messages::{Assignment, AssignmentReport, AssignmentStart, Outcome, WalkEnd, WalkProgress};
 use crate::walk_trace::TracePoint;
 
 const MAGIC: [u8; 4] = *b"CALM";
-const VERSION: u8 = 4;
+const VERSION: u8 = 5;
 const PREFIX: usize = MAGIC.len() + 1 + 4;
 
 /// Why bytes are not a valid control message.
@@ -100,6 +100,7 @@ pub(crate) enum ControlError {
 pub(crate) struct EncodedReport<'a> {
     walk: WalkId,
     assignment: u64,
+    start: Cow<'a, Option<AssignmentStart>>,
     outcome: EncodedOutcome<'a>,
     #[serde(serialize_with = "crate::bytes::serialize")]
     checkpoint: &'a [u8],
@@ -127,7 +128,8 @@ impl<'a> EncodedReport<'a> {
         };
         let (checkpoint, progress) = (report.checkpoint.as_slice(), Cow::Borrowed(&report.progress));
         let trace = Cow::Borrowed(report.trace.as_slice());
-        Self { walk: report.walk, assignment: report.assignment, outcome, checkpoint, progress, trace }
+        let (walk, assignment, start) = (report.walk, report.assignment, Cow::Borrowed(&report.start));
+        Self { walk, assignment, start, outcome, checkpoint, progress, trace }
     }
 
     /// The report with its candidate, which arrived separately.
@@ -135,11 +137,12 @@ impl<'a> EncodedReport<'a> {
         self,
         candidate: Option<CandidateBlock>,
     ) -> Result<AssignmentReport, ControlError> {
-        let Self { walk, assignment, outcome, checkpoint, progress, trace } = self;
+        let Self { walk, assignment, start, outcome, checkpoint, progress, trace } = self;
         let outcome = checked_outcome(walk, outcome, candidate)?;
         Ok(AssignmentReport {
             walk,
             assignment,
+            start: start.into_owned(),
             outcome,
             checkpoint: checkpoint.to_vec(),
             progress: progress.into_owned(),

@@ -2,6 +2,8 @@
 //! walk, and an [`AssignmentReport`] is the complete result. The same checkpoint gives the same report on any walker,
 //! any number of times, which makes a campaign crash-only.
 
+use std::cmp::Ordering;
+
 use atoms::Structure;
 use serde::{Deserialize, Serialize};
 
@@ -101,6 +103,24 @@ impl DeclineReason {
     }
 }
 
+impl Verdict {
+    /// `"accepted"`, or the reason of the decline.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Accepted => "accepted",
+            Self::Declined(reason) => reason.name(),
+        }
+    }
+
+    /// The verdict with this name.
+    pub fn named(name: &str) -> Option<Self> {
+        if name == Self::Accepted.name() {
+            return Some(Self::Accepted);
+        }
+        DeclineReason::ALL.into_iter().find(|reason| reason.name() == name).map(Self::Declined)
+    }
+}
+
 /// How an assignment ended. A walker holds its candidate as a [`crate::Candidate`]; the transport encodes it directly
 /// into the memory where it is read, so the reactor receives a block.
 #[derive(Clone, Debug, PartialEq)]
@@ -173,6 +193,8 @@ pub struct AssignmentReport<C = CandidateBlock> {
     pub walk: WalkId,
     /// Number of the assignment that this report answers.
     pub assignment: u64,
+    /// With what it began; `None` if the walk made no step.
+    pub start: Option<AssignmentStart>,
     /// How it ended.
     pub outcome: Outcome<C>,
     /// The walker's checkpoint of the walk, from which the next assignment continues.
@@ -192,8 +214,8 @@ impl<C> AssignmentReport<C> {
             Outcome::Interrupted => Outcome::Interrupted,
             Outcome::Ended(end) => Outcome::Ended(end),
         };
-        let Self { walk, assignment, checkpoint, progress, trace, .. } = self;
-        AssignmentReport { walk, assignment, outcome, checkpoint, progress, trace }
+        let Self { walk, assignment, start, checkpoint, progress, trace, .. } = self;
+        AssignmentReport { walk, assignment, start, outcome, checkpoint, progress, trace }
     }
 }
 
@@ -218,4 +240,82 @@ pub struct WalkProgress {
     pub rollbacks: u32,
     /// Start and target step of the last rollback, for the decision log; not stored with the progress.
     pub last_rollback: Option<(u64, u64)>,
+    /// Step of the reference run, as long as it lasts; not stored with the progress.
+    pub reference_step: Option<u64>,
+    /// V₀ of a walk at constant pressure from its first step on, Å³ (Å² for a slab, Å for a wire); another table has it.
+    pub reference_volume: Option<f64>,
+}
+
+impl WalkProgress {
+    /// Where the walk is.
+    pub fn position(&self) -> PathPosition {
+        let Self { segment, step, reference_step, .. } = *self;
+        PathPosition { segment, step, reference_step }
+    }
+}
+
+/// A place on the path of a walk. One that the walk comes to later is larger.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PathPosition {
+    /// Segment.
+    pub segment: u32,
+    /// Step, including equilibration.
+    pub step: u64,
+    /// Step of the reference run, as long as it lasts.
+    pub reference_step: Option<u64>,
+}
+
+impl Ord for PathPosition {
+    fn cmp(&self, other: &Self) -> Ordering {
+        let key = |at: &Self| (at.segment, at.reference_step.is_none(), at.reference_step, at.step);
+        key(self).cmp(&key(other))
+    }
+}
+
+impl PartialOrd for PathPosition {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+/// What a walker began an assignment with. The store keeps it, so that the walk can be run again.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct AssignmentStart {
+    /// Where the walk was.
+    pub position: PathPosition,
+    /// Version of the walker's mixture.
+    pub mixture_version: u64,
+    /// [`Assignment::threshold_factor`].
+    pub threshold_factor: f64,
+    /// [`Assignment::verdict`].
+    pub verdict: Option<Verdict>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn later_places_on_a_path_are_larger() {
+        let at = |segment, reference_step, step| PathPosition { segment, step, reference_step };
+        let path = [
+            at(0, Some(0), 0),
+            at(0, Some(3200), 0),
+            at(0, None, 0),
+            at(0, None, 150),
+            // A roll back goes to an earlier step, in a new segment.
+            at(1, None, 100),
+            at(1, None, 101),
+        ];
+        assert!(path.windows(2).all(|pair| pair[0] < pair[1]));
+    }
+
+    #[test]
+    fn verdicts_are_found_by_their_names() {
+        let declined = DeclineReason::ALL.map(Verdict::Declined);
+        for verdict in declined.into_iter().chain([Verdict::Accepted]) {
+            assert_eq!(Verdict::named(verdict.name()), Some(verdict));
+        }
+        assert_eq!(Verdict::named("declined"), None);
+    }
 }

@@ -118,10 +118,10 @@ impl Walker {
             let walk = if plan.rate > 0.0 { WALKERS as f64 / plan.rate } else { 0.0 };
             sleep(Duration::from_secs_f64(walk * (0.5 + self.random.uniform()))).await;
             let candidate = self.candidate(&work.assignment, &work.mixture);
-            report = SlotReport::Report(campaign::report(
+            report = SlotReport::Report(Box::new(campaign::report(
                 &work.assignment,
                 Some(CandidateBlock::encode(&candidate)),
-            ));
+            )));
         }
     }
 

@@ -119,6 +119,7 @@ pub fn report(assignment: &Assignment, block: Option<CandidateBlock>) -> Assignm
         outcome: block.map_or(Outcome::Ended(WalkEnd::Completed), Outcome::Candidate),
         checkpoint,
         progress: progress(assignment.number),
+        start: None,
         trace: Vec::new(),
     }
 }

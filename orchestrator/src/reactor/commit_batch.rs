@@ -7,7 +7,8 @@ use store::records::Commit;
 
 /// Appends `later` to `commit`.
 pub fn append(commit: &mut Commit, later: Commit) {
-    let Commit { decisions, candidates, components, restart_mixture, walks, values, traces } = later;
+    let Commit { decisions, candidates, components, restart_mixture, walks, values, traces, assignments } =
+        later;
     commit.decisions.extend(decisions);
     commit.candidates.extend(candidates);
     if restart_mixture {
@@ -15,6 +16,7 @@ pub fn append(commit: &mut Commit, later: Commit) {
         commit.restart_mixture = true;
     }
     commit.traces.extend(traces);
+    commit.assignments.extend(assignments);
     // Of records that are overwritten, only the newest is kept.
     replace(&mut commit.components, components, |component| (component.element, component.slot));
     replace(&mut commit.walks, walks, |walk| walk.walk);

@@ -90,6 +90,7 @@ impl DecisionState {
     fn apply_report(&mut self, report: &RegradedReport, commit: &mut Commit) -> u64 {
         let steps_per_assignment = self.settings.steps_per_assignment;
         let walk = self.walks.count_report(report.walk);
+        commit.assignments.extend(walk.assignment_record(report));
         let steps = match walk.is_biased() {
             true => report.progress.step.saturating_sub(walk.counted_step(steps_per_assignment)),
             false => 0,

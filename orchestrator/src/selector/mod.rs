@@ -201,8 +201,16 @@ impl Selector {
         let WalkRecord { assignments: number, checkpoint, progress, .. } = walk.record.clone();
         let (checkpoint, outcome) =
             (checkpoint.unwrap_or_default(), Outcome::Ended(WalkEnd::Diverged { reason }));
-        let trace = Vec::new();
-        self.report(AssignmentReport { walk: id, assignment: number, outcome, checkpoint, progress, trace })
+        let (start, trace) = (None, Vec::new());
+        self.report(AssignmentReport {
+            walk: id,
+            assignment: number,
+            start,
+            outcome,
+            checkpoint,
+            progress,
+            trace,
+        })
     }
 
     /// Regrades reports for [`Selector::report_regraded`], for example on other threads.
@@ -226,8 +234,7 @@ impl Selector {
         self.assigned.remove(&id);
         if matches!(report.outcome, Outcome::Interrupted) {
             let walk = self.decisions.walk_mut(id);
-            let traces = vec![(id, walk.interrupt(report))];
-            let commit = Commit { walks: vec![walk.to_record()], traces, ..Commit::default() };
+            let commit = walk.interrupt(report);
             self.update_ready([id]);
             return Ok(Some(commit));
         }

@@ -1,9 +1,9 @@
 //! A walk, as the selector sees it.
 
 use serde::{Deserialize, Serialize};
-use store::records::WalkRecord;
+use store::records::{AssignmentRecord, Commit, WalkRecord};
 use wire::messages::{AssignmentReport, Verdict, WalkEnd, WalkProgress};
-use wire::{Origin, TracePoint, WalkConditions, WalkId};
+use wire::{Origin, WalkConditions, WalkId};
 
 use super::error::SelectorError;
 
@@ -28,6 +28,9 @@ pub(super) struct SelectorState {
     pub accepted_steps: Vec<u64>,
     /// Number of accepted steps for which a control walk exists.
     pub controlled: usize,
+    /// Number of records of its assignments; `None` if the walk began under a version that kept none.
+    #[serde(default)]
+    pub records: Option<u64>,
 }
 
 impl Walk {
@@ -46,7 +49,7 @@ impl Walk {
             selector_state: String::new(),
             checkpoint: None,
         };
-        Self { record, state: SelectorState { until, ..SelectorState::default() } }
+        Self { record, state: SelectorState { until, records: Some(0), ..SelectorState::default() } }
     }
 
     /// Whether it has accepted structures without a control walk.
@@ -106,12 +109,23 @@ impl Walk {
     }
 
     /// Records where an assignment was interrupted; it continues from there. The checkpoint already accounts for the
-    /// verdict with which it started. Returns the points of its trace.
-    pub fn interrupt<C>(&mut self, report: AssignmentReport<C>) -> Vec<TracePoint> {
+    /// verdict with which it started.
+    pub fn interrupt<C>(&mut self, report: AssignmentReport<C>) -> Commit {
+        let assignments = self.assignment_record(&report).into_iter().collect();
         self.record.checkpoint = Some(report.checkpoint);
         self.record.progress = report.progress;
         self.state.verdict = None;
-        report.trace
+        let traces = vec![(self.record.walk, report.trace)];
+        Commit { walks: vec![self.to_record()], traces, assignments, ..Commit::default() }
+    }
+
+    /// What the store keeps of an assignment, or of the part of it that was interrupted. Counts the records.
+    pub fn assignment_record<C>(&mut self, report: &AssignmentReport<C>) -> Option<AssignmentRecord> {
+        let (start, records) = (report.start.clone()?, self.state.records.as_mut()?);
+        let part = *records;
+        *records += 1;
+        let (walk, number, end) = (self.record.walk, report.assignment, report.progress.position());
+        Some(AssignmentRecord { walk, part, number, start, end })
     }
 
     /// Whether it ended only because of a limit.

@@ -230,6 +230,7 @@ pub fn report(assignment: &Assignment, outcome: Outcome, progress: WalkProgress)
         outcome,
         checkpoint,
         progress,
+        start: None,
         trace: Vec::new(),
     }
 }

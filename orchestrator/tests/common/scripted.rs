@@ -73,6 +73,7 @@ pub fn advance(
         outcome,
         checkpoint,
         progress: progress(&state),
+        start: None,
         trace: Vec::new(),
     }
 }

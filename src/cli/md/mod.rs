@@ -1,7 +1,6 @@
 //! `calmwalk md`
 
 mod config;
-mod trajectory;
 
 use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
@@ -12,11 +11,11 @@ use atoms::units::GPA_PER_EV_A3;
 use md::{Dynamics, DynamicsSettings, State, Stream, default_time_step};
 
 use self::config::{DynamicsSection, MdConfig, OutputSection};
-use self::trajectory::{Trajectory, time};
 use super::{CommandError, ExitStatus};
 use crate::atomic_file::refuse_to_replace;
 use crate::output::{Bar, count, decimals, print};
 use crate::signals;
+use crate::trajectory::{Trajectory, TrajectoryStep};
 
 const BAR: &str = "{bar:32} {pos}/{len} steps  {eta} left  {msg}";
 
@@ -58,22 +57,25 @@ impl MdArgs {
         let outcome = integrate(&mut dynamics, &mut *potential, config.dynamics.steps, |dynamics| {
             progress.update(dynamics);
             if dynamics.state().step.is_multiple_of(config.output.every.get()) {
-                trajectory.push(dynamics)?;
+                trajectory.push(&TrajectoryStep::of_run(dynamics))?;
             }
             Ok(!stopping.is_cancelled())
         });
         drop(progress);
+        if outcome.is_ok() && !dynamics.state().step.is_multiple_of(config.output.every.get()) {
+            trajectory.push(&TrajectoryStep::of_run(&dynamics))?;
+        }
         let (frames, file) = (trajectory.frames, path.display());
+        trajectory.finish()?;
         outcome.map_err(|failure| match failure {
             CommandError::Failed(message) => {
                 CommandError::Failed(format!("{message}; {frames} frames are in {file}"))
             }
             other => other,
         })?;
-        trajectory.push(&dynamics)?;
         print(|out| {
             let (steps, seconds) = (dynamics.state().step, started.elapsed().as_secs_f64());
-            let (frames, atoms) = (trajectory.frames, dynamics.structure().len());
+            let atoms = dynamics.structure().len();
             let (steps, atoms, frames) = (count(steps, "step"), count(atoms, "atom"), count(frames, "frame"));
             writeln!(out, "{steps} of {atoms} in {seconds:.1} s, {frames} in {file}")
         })?;
@@ -143,7 +145,7 @@ impl MdProgress {
         } else if step.is_multiple_of(self.every) {
             let mut row = vec![
                 step.to_string(),
-                format!("{:.3}", time(dynamics) / 1000.0),
+                format!("{:.3}", TrajectoryStep::of_run(dynamics).time / 1000.0),
                 format!("{:.6}", dynamics.evaluation().energy()),
                 format!("{:.1}", dynamics.temperature()),
                 decimals(dynamics.conserved_energy(), 6),

@@ -62,13 +62,14 @@ pub fn line(walk: &WalkStatus, varied: &VariedConditions, run_active: bool, name
     let state = match walk.state.as_str() {
         _ if walk.paused => "paused".to_owned(),
         "running" if !run_active => "stopped".to_owned(),
+        _ if walk.reference_step.is_some() => "reference run".to_owned(),
         state => state.replace('_', " "),
     };
     vec![
         walk.walk.to_string(),
         name,
         state,
-        walk.step.to_string(),
+        walk.reference_step.unwrap_or(walk.step).to_string(),
         decimals(walk.steps_per_second, 1),
         decimals(walk.temperature, 0),
         decimals(walk.relative_volume, 3),
@@ -89,6 +90,13 @@ mod tests {
             steps_per_second: speed,
             ..WalkStatus::default()
         }
+    }
+
+    #[test]
+    fn a_walk_in_its_reference_run_shows_its_steps_there() {
+        let walk = WalkStatus { reference_step: Some(3200), ..walk(1, "running", 0.0, Some(10.0)) };
+        let row = line(&walk, &VariedConditions::default(), true, NAME);
+        assert_eq!((row[2].as_str(), row[3].as_str(), row[4].as_str()), ("reference run", "3200", "10.0"));
     }
 
     #[test]

@@ -159,6 +159,12 @@ function budget(status) {
   ]);
 }
 
+function stateOf(walk, isRunning) {
+  if (walk.paused) return "paused";
+  if (!isRunning && walk.state === "running") return "stopped";
+  return walk.reference_step == null ? walk.state : "reference_run";
+}
+
 /** `changed` is called after walks were paused or resumed; false if they cannot be. */
 function walks({ walks: all, run_active }, changed) {
   const order = [...all].sort((a, b) => isUnderWay(b) - isUnderWay(a) || a.walk - b.walk);
@@ -169,8 +175,8 @@ function walks({ walks: all, run_active }, changed) {
   };
   const button = (walk) => (isUnderWay(walk) || walk.paused) && pauseButton(walk.walk, walk.paused, change([walk], !walk.paused));
   const rows = order.slice(0, WALKS).map((walk) => [
-    element("a", { href: `#walk/${walk.walk}`, "data-keep": `walk-${walk.walk}` }, whole(walk.walk)), walk.seed_structure, walk.origin, sentence(state(walk.paused ? "paused" : !run_active && walk.state === "running" ? "stopped" : walk.state), walk.reason && ` ${walk.reason}`),
-    whole(walk.step), decimals(walk.temperature, 0, "K"), decimals(walk.relative_volume, 4), decimals(walk.gamma_max, 2),
+    element("a", { href: `#walk/${walk.walk}`, "data-keep": `walk-${walk.walk}` }, whole(walk.walk)), walk.seed_structure, walk.origin, sentence(state(stateOf(walk, run_active)), walk.reason && ` ${walk.reason}`),
+    whole(walk.reference_step ?? walk.step), decimals(walk.temperature, 0, "K"), decimals(walk.relative_volume, 4), decimals(walk.gamma_max, 2),
     digits(walk.tau), digits(walk.steps_per_second), whole(walk.accepted), whole(walk.rejected), ...(changed ? [button(walk) || ""] : [])]);
   const more = all.length - rows.length;
   const [going, paused] = [all.filter((walk) => isUnderWay(walk) && !walk.paused), all.filter((walk) => walk.paused)];

@@ -14,7 +14,7 @@ use crate::database::{FromRow, SqlRow, from_columns, query};
 use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
 use crate::jobs::JobDetails;
-use crate::records::{CandidateRef, LoggedOperation, Protocol};
+use crate::records::{CandidateRef, LoggedOperation, Protocol, StoredCandidate};
 use crate::status::WalkStatus;
 
 /// Number of candidates shown if a name fits none or several.
@@ -213,6 +213,20 @@ impl Store {
         let begin = format!("{}-{walk}.", self.campaign_prefix().await?);
         let step = crate::encoding::integer("step", step)?;
         query(AT_STEP).bind(begin).bind(step).fetch_optional(&self.database).await
+    }
+
+    /// The candidate of a walk in a segment at a step, `None` if there is none.
+    pub async fn candidate_at(
+        &self,
+        walk: WalkId,
+        segment: u32,
+        step: u64,
+    ) -> Result<Option<StoredCandidate>> {
+        let begin = format!("{}-{walk}.{segment}.{step}-", self.campaign_prefix().await?);
+        match self.names_with_prefix(&begin).await?.first() {
+            Some(found) => self.candidate(&found.candidate).await,
+            None => Ok(None),
+        }
     }
 
     /// The state of a walk, and for a control walk the biased walk that it matches.

@@ -1,6 +1,7 @@
 //! The functions of [`crate::Store`] that access its tables, one file per topic.
 
 mod archives;
+mod assignments;
 pub mod attempt_end;
 pub mod budget;
 pub mod candidate_history;

@@ -99,6 +99,19 @@ impl Store {
         Ok(walks)
     }
 
+    /// One walk, `None` if there is none.
+    pub async fn load_walk(&self, walk: WalkId) -> Result<Option<WalkRecord>> {
+        let mut transaction = self.database.begin_read().await?;
+        let found = query("SELECT * FROM walk WHERE walk = $1").bind(walk.0);
+        let mut found: Option<WalkRecord> = found.fetch_optional(&mut transaction).await?;
+        if let Some(found) = &mut found {
+            let mut conditions = walk_conditions::read(&mut transaction).await?;
+            found.conditions = conditions.remove(&walk).unwrap_or_default();
+        }
+        transaction.commit().await?;
+        Ok(found)
+    }
+
     /// Every component that has changed since the mixture was last restarted, by element and slot.
     pub async fn load_components(&self) -> Result<Vec<ComponentRecord>> {
         components(&self.database).await
@@ -228,6 +241,8 @@ impl WalkRow {
                 rejected: self.rejected,
                 rollbacks: self.rollbacks,
                 last_rollback: None,
+                reference_step: None,
+                reference_volume: None,
             },
             selector_state: self.selector_state,
             checkpoint: self.checkpoint,

@@ -3,7 +3,8 @@
 use wire::WalkId;
 
 use super::{
-    budget, exclude, job_counts, lower_states, pauses, processes, relabel, walk_conditions, walk_progress,
+    assignments, budget, exclude, job_counts, lower_states, pauses, processes, relabel, walk_conditions,
+    walk_progress,
 };
 use crate::Store;
 use crate::budget::{Budget, BudgetStatus};
@@ -68,8 +69,10 @@ impl Store {
         let labels_last_hour = job_counts::labels_in_last_hour(&mut transaction, now).await?;
         let mut walks: Vec<WalkStatus> = query(walks!("ORDER BY walk")).fetch_all(&mut transaction).await?;
         let mut conditions = walk_conditions::read(&mut transaction).await?;
+        let volumes = assignments::reference_volumes(&mut transaction).await?;
         for walk in &mut walks {
             walk.conditions = conditions.remove(&WalkId(walk.walk));
+            walk.reference_volume = volumes.get(&walk.walk).copied();
         }
         let rejected = query("SELECT CAST(coalesce(sum(rejected), 0) AS BIGINT) FROM walk");
         let rejected: u64 = rejected.fetch_one(&mut transaction).await?;
@@ -135,7 +138,10 @@ fn apply_progress(walks: &mut [WalkStatus], progress: &[WalkProgressRecord]) {
         let Ok(found) = progress.binary_search_by_key(&walk.walk, |latest| latest.walk) else { continue };
         let latest = &progress[found];
         walk.steps_per_second = latest.steps_per_second;
-        if (latest.segment, latest.step) > (walk.segment, walk.step) {
+        walk.reference_step = latest.reference_step.filter(|_| walk.reference_volume.is_none());
+        if walk.reference_step.is_some() {
+            walk.temperature = latest.temperature;
+        } else if (latest.segment, latest.step) > (walk.segment, walk.step) {
             (walk.segment, walk.step, walk.tau) = (latest.segment, latest.step, latest.tau);
             (walk.temperature, walk.relative_volume) = (latest.temperature, latest.relative_volume);
             walk.gamma_max = latest.gamma_max;

@@ -14,7 +14,7 @@ const MAX_AGE: i64 = 60_000;
 /// The campaign key of the total.
 const TOTAL_KEY: &str = "throughput";
 
-const COLUMNS: [&str; 9] = [
+const COLUMNS: [&str; 10] = [
     "walk",
     "seen",
     "segment",
@@ -24,6 +24,7 @@ const COLUMNS: [&str; 9] = [
     "temperature",
     "relative_volume",
     "gamma_max",
+    "reference_step",
 ];
 
 const UPSERT: &str = "INSERT INTO walk_progress ({columns}) SELECT * FROM {rows} WHERE TRUE
@@ -50,6 +51,7 @@ impl Store {
                 SqlValue::Real(finite(walk.temperature)),
                 SqlValue::Real(finite(walk.relative_volume)),
                 SqlValue::Real(finite(walk.gamma_max)),
+                SqlValue::Integer(walk.reference_step.map(|step| i64::try_from(step).unwrap_or(i64::MAX))),
             ]
         };
         let mut transaction = self.database.begin_as_leader().await?;

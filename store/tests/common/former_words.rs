@@ -7,14 +7,20 @@ use wire::{Origin, WalkId};
 
 use super::{candidate, commit_of, name_of, protocol, walk};
 
+/// Turns the tables into those of version 19, without the number of the version.
+pub const TO_VERSION_19: &str = "DROP TABLE assignment; DROP TABLE reference_volume;
+    ALTER TABLE walk_progress DROP COLUMN reference_step; DELETE FROM _sqlx_migrations WHERE version > 19";
+
 /// Turns the tables into those of version 17, without the number of the version.
 pub const TO_VERSION_17: &str = "DROP INDEX job_order;
+    DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
     DROP TABLE walk_trace; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
     CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
     DELETE FROM _sqlx_migrations WHERE version > 17";
 
 /// Turns the tables into those of version 16, without the number of the version.
 pub const TO_VERSION_16: &str = "DROP INDEX job_order;
+    DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
     DROP TABLE walk_trace; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
     CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
     DROP TABLE version_file; DROP TABLE version;
@@ -24,6 +30,7 @@ pub const TO_VERSION_16: &str = "DROP INDEX job_order;
 /// of the candidate is unknown, since no program of this version writes its word.
 pub const TO_VERSION_15: &str = "
     DROP INDEX job_order;
+    DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
     DROP TABLE walk_trace; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
     CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
     DROP TABLE version_file; DROP TABLE version;

@@ -167,14 +167,15 @@ mod tests {
         let mut metrics = AgentMetrics::default();
         let report = |outcome| {
             let checkpoint = Vec::new();
-            SlotReport::Report(AssignmentReport {
+            SlotReport::Report(Box::new(AssignmentReport {
                 walk: WALK,
                 assignment: 0,
                 outcome,
                 checkpoint,
                 progress: at(0, 1),
+                start: None,
                 trace: Vec::new(),
-            })
+            }))
         };
         let ended = || report(Outcome::Ended(WalkEnd::Completed));
         for sent in [

@@ -18,7 +18,7 @@ pub(super) struct AssignmentPool<S = Slot> {
     /// The assignment of each busy walker.
     assigned: BTreeMap<u32, (Option<S>, WalkId)>,
     /// Reports whose slots are lost.
-    unsent: VecDeque<AssignmentReport>,
+    unsent: VecDeque<Box<AssignmentReport>>,
     /// Slots that may still get work.
     open_slots: usize,
 }
@@ -56,10 +56,10 @@ impl<S> AssignmentPool<S> {
         self.waiting.push_back((walker, reply));
         self.dispatch();
         match (slot, report) {
-            (Some(slot), Some(report)) => Some((slot, SlotReport::Report(report))),
+            (Some(slot), Some(report)) => Some((slot, SlotReport::Report(Box::new(report)))),
             (Some(slot), None) => Some((slot, SlotReport::Lost { crashed: false })),
             (None, report) => {
-                self.unsent.extend(report);
+                self.unsent.extend(report.map(Box::new));
                 None
             }
         }

@@ -136,6 +136,18 @@ impl RunningWalk<'_> {
         Ok(())
     }
 
+    /// Step of the reference run, as long as it lasts.
+    pub(super) fn reference_step(&self) -> Option<u64> {
+        self.state.reference_run.as_ref().map(|_| self.dynamics.state().step)
+    }
+
+    /// V₀ of a walk at constant pressure, once it is known.
+    pub(super) fn reference_volume(&self) -> Option<f64> {
+        let is_known =
+            self.assignment.conditions.constant_pressure.is_some() && self.state.reference_run.is_none();
+        is_known.then_some(self.state.reference_volume)
+    }
+
     /// Where the walk is, for the reason of its end: `at step 12`.
     pub(super) fn place(&self) -> String {
         match self.state.reference_run {

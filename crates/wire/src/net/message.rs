@@ -44,7 +44,7 @@ pub(super) enum AgentRequest<'a> {
     Join(AgentInfo),
     /// A walker's message about a slot.
     #[serde(borrow)]
-    Envelope(Envelope<'a>),
+    Envelope(Box<Envelope<'a>>),
     /// Replaces an offer: the walker that worked on the slot's assignment has exited.
     Lost { sender: SenderId, sequence: u64, crashed: bool },
     /// Requests mixture version `wanted`, as a delta to version `have`, without the first `skip` components.

@@ -81,7 +81,7 @@ impl AgentSession {
         let (control, block) = frame::split(payload)?;
         match decode(control)? {
             AgentRequest::Join(agent) => self.join(query, agent)?,
-            AgentRequest::Envelope(envelope) => self.slots.receive(envelope, query, block)?,
+            AgentRequest::Envelope(envelope) => self.slots.receive(*envelope, query, block)?,
             AgentRequest::Lost { sender, sequence, crashed } => {
                 self.slots.receive_loss(sender, sequence, crashed, query)?;
             }

@@ -27,7 +27,7 @@ pub enum SlotReport {
     /// There was no assignment.
     Empty,
     /// The walker's report.
-    Report(AssignmentReport),
+    Report(Box<AssignmentReport>),
     /// The walker has exited.
     Lost {
         /// Whether it crashed: the assignment may crash the next walker as well.
@@ -56,7 +56,9 @@ impl Slot {
     ) -> Result<Option<WorkItem>, LinkError> {
         self.sequence += 1;
         let (offer, candidate) = self.offer(report);
-        let poll = encode(&AgentRequest::Envelope(self.envelope(Payload::Poll { sequence: self.sequence })));
+        let poll = encode(&AgentRequest::Envelope(Box::new(
+            self.envelope(Payload::Poll { sequence: self.sequence }),
+        )));
         let mut offered = false;
         loop {
             let sent_at = Instant::now();
@@ -101,7 +103,7 @@ impl Slot {
         progress: WalkProgress,
     ) -> impl Future<Output = ()> + Send + use<> {
         let envelope = self.envelope(Payload::Progress(walk, Cow::Owned(progress)));
-        let request = encode(&AgentRequest::Envelope(envelope));
+        let request = encode(&AgentRequest::Envelope(Box::new(envelope)));
         async move { drop(membership.client().send_once(&request, None).await) }
     }
 
@@ -114,7 +116,7 @@ impl Slot {
         match slot_report {
             SlotReport::Empty => {
                 let payload = Payload::Offer { sequence, report: None };
-                (encode(&AgentRequest::Envelope(self.envelope(payload))), None)
+                (encode(&AgentRequest::Envelope(Box::new(self.envelope(payload)))), None)
             }
             SlotReport::Report(report) => {
                 let encoded = EncodedReport::new(report, |block| block.view().id());
@@ -123,7 +125,7 @@ impl Slot {
                     Outcome::Candidate(block) => Some(CandidateBlock::as_bytes(block)),
                     _ => None,
                 };
-                (encode(&AgentRequest::Envelope(self.envelope(payload))), candidate)
+                (encode(&AgentRequest::Envelope(Box::new(self.envelope(payload)))), candidate)
             }
             SlotReport::Lost { crashed } => {
                 (encode(&AgentRequest::Lost { sender, sequence, crashed: *crashed }), None)

@@ -67,8 +67,15 @@ fn walk(door: &ConnectInfo, stuck: bool) {
             sleep(Duration::MAX);
         }
         let outcome = Outcome::Candidate(candidate);
-        report =
-            Some(AssignmentReport { walk, assignment: number, outcome, checkpoint, progress, trace: vec![] });
+        report = Some(AssignmentReport {
+            walk,
+            assignment: number,
+            start: None,
+            outcome,
+            checkpoint,
+            progress,
+            trace: vec![],
+        });
     }
     assert!(walker.failure().is_none(), "{:?}", walker.failure());
 }

@@ -24,7 +24,7 @@ async fn reports_over_a_breaking_link_arrive_once() {
         let mut last_report = SlotReport::Empty;
         while let Some(work) = slot.exchange(&line, &last_report).await.unwrap() {
             sleep(Duration::from_millis(300)).await;
-            last_report = SlotReport::Report(report(&work.assignment));
+            last_report = SlotReport::Report(Box::new(report(&work.assignment)));
         }
     });
     let mut mixture = Arc::new(mixture());
@@ -93,7 +93,7 @@ async fn lost_agents_stay_lost_and_may_join_again() {
     server.event(|event| matches!(event, AgentEvent::Lost(_))).await;
 
     link.set(State::Whole);
-    let last_report = SlotReport::Report(report(&assignment));
+    let last_report = SlotReport::Report(Box::new(report(&assignment)));
     let refused = timeout(LIMIT, slot.exchange(&membership, &last_report)).await.expect("in time");
     assert!(matches!(refused, Err(LinkError::RejoinRequired(_))), "{refused:?}");
     assert!(matches!(waiting.await.unwrap(), Err(LinkError::RejoinRequired(_))));
@@ -123,7 +123,7 @@ async fn an_agent_finds_the_next_run_of_its_orchestrator() {
     let (given, mut slot) = exchange.await.unwrap();
     let assignment = given.unwrap().unwrap().assignment;
     let port = server.kill().await;
-    let last_report = SlotReport::Report(report(&assignment));
+    let last_report = SlotReport::Report(Box::new(report(&assignment)));
     let line = Arc::clone(&membership);
     let telling = tokio::spawn(async move { slot.exchange(&line, &last_report).await.map(drop) });
     sleep(Duration::from_millis(500)).await;
@@ -134,7 +134,7 @@ async fn an_agent_finds_the_next_run_of_its_orchestrator() {
     let membership = timeout(LIMIT, client.join()).await.expect("in time").unwrap();
     assert_eq!(membership.newest().await.version(), 1);
     let mut slot = membership.slots().remove(0);
-    let last_report = SlotReport::Report(report(&assignment));
+    let last_report = SlotReport::Report(Box::new(report(&assignment)));
     let telling = async { slot.exchange(&membership, &last_report).await.unwrap().is_none() };
     let (dismissed, found) = tokio::join!(telling, async {
         let offer = server.offer().await;

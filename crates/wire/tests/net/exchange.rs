@@ -25,7 +25,7 @@ async fn assignments_and_reports_survive_a_round_trip() {
             assert_eq!(work.assignment.number, assignments);
             assert_eq!(work.mixture.version(), assignments, "the version of the assignment");
             slot.progress(Arc::clone(&line), work.assignment.walk, WalkProgress::default()).await;
-            last_report = SlotReport::Report(report(&work.assignment));
+            last_report = SlotReport::Report(Box::new(report(&work.assignment)));
         }
         assignments
     });

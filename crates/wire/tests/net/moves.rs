@@ -39,7 +39,7 @@ async fn an_agent_follows_the_orchestrator_to_another_endpoint() {
     let exchange = tokio::spawn(async move { (slot.exchange(&line, &SlotReport::Empty).await, slot) });
     server.offer().await.reply.send(Some(work(4, 1, &mixture))).unwrap();
     let (given, mut slot) = exchange.await.unwrap();
-    let last_report = SlotReport::Report(report(&given.unwrap().unwrap().assignment));
+    let last_report = SlotReport::Report(Box::new(report(&given.unwrap().unwrap().assignment)));
     let before = server.kill().await;
     let line = Arc::clone(&membership);
     let telling = tokio::spawn(async move { slot.exchange(&line, &last_report).await.map(drop) });

@@ -212,6 +212,7 @@ pub fn report(assignment: &Assignment) -> AssignmentReport {
         outcome,
         checkpoint: number.to_le_bytes().to_vec(),
         progress: WalkProgress::default(),
+        start: None,
         trace: Vec::new(),
     }
 }

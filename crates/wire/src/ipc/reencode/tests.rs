@@ -156,7 +156,7 @@ proptest! {
     fn reports_with_candidates_of_other_walks_are_rejected(sender in sender(), candidate in candidate()) {
         let walk = WalkId(candidate.id.walk.0 ^ 1);
         let (outcome, checkpoint) = (Outcome::Candidate(candidate), Vec::new());
-        let report = AssignmentReport { walk, assignment: 0, outcome, checkpoint, progress: WalkProgress::default(), trace: vec![] };
+        let report = AssignmentReport { walk, assignment: 0, start: None, outcome, checkpoint, progress: WalkProgress::default(), trace: vec![] };
         prop_assert!(is_about_the_candidate(&super::request(&offered(sender, 1, Some(&report)))));
     }
 
@@ -236,8 +236,15 @@ fn excessive_lengths_are_rejected() {
     let sender = SenderId { session: 0, walker: 0, incarnation: 0 };
     let outcome = Outcome::Ended(WalkEnd::Diverged { reason: "a reason".to_owned() });
     let (checkpoint, progress) = (b"checkpoint".to_vec(), WalkProgress::default());
-    let report =
-        AssignmentReport { walk: WalkId(0), assignment: 0, outcome, checkpoint, progress, trace: vec![] };
+    let report = AssignmentReport {
+        walk: WalkId(0),
+        assignment: 0,
+        start: None,
+        outcome,
+        checkpoint,
+        progress,
+        trace: vec![],
+    };
     let offer = offered(sender, 1, Some(&report));
     assert!(super::request(&offer).is_ok());
     assert!(is_refused_with_excessive_length(super::request, &offer, b"a reason"));

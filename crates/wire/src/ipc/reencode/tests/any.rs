@@ -11,7 +11,9 @@ use super::encode_message;
 use crate::block::Candidate;
 use crate::conditions::{ConstantPressure, WalkConditions};
 use crate::ids::{CampaignId, Origin, WalkId};
-use crate::messages::{Assignment, AssignmentReport, DeclineReason, Outcome, Verdict, WalkEnd, WalkProgress};
+use crate::messages::{
+    Assignment, AssignmentReport, AssignmentStart, DeclineReason, Outcome, Verdict, WalkEnd, WalkProgress,
+};
 use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
 use crate::walk_trace::TracePoint;
 
@@ -38,15 +40,12 @@ fn end() -> impl Strategy<Value = WalkEnd> {
 
 fn progress() -> impl Strategy<Value = WalkProgress> {
     let numbers = [(); 4].map(|()| -1e3..1e9);
-    (any::<u64>(), any::<u32>(), numbers, any::<u64>(), any::<u32>(), any::<Option<(u64, u64)>>()).prop_map(
-        |(
-            step,
-            segment,
-            [tau, temperature, relative_volume, gamma_max],
-            rejected,
-            rollbacks,
-            last_rollback,
-        )| {
+    let counts = (any::<u64>(), any::<u32>(), any::<Option<(u64, u64)>>());
+    let reference = (any::<Option<u64>>(), option::of(1.0..1e6));
+    (any::<u64>(), any::<u32>(), numbers, counts, reference).prop_map(
+        |(step, segment, [tau, temperature, relative_volume, gamma_max], counts, reference)| {
+            let (rejected, rollbacks, last_rollback) = counts;
+            let (reference_step, reference_volume) = reference;
             WalkProgress {
                 step,
                 segment,
@@ -57,6 +56,8 @@ fn progress() -> impl Strategy<Value = WalkProgress> {
                 rejected,
                 rollbacks,
                 last_rollback,
+                reference_step,
+                reference_volume,
             }
         },
     )
@@ -122,14 +123,27 @@ pub fn report() -> impl Strategy<Value = AssignmentReport<Candidate>> {
         Just(Outcome::Interrupted),
         end().prop_map(Outcome::Ended),
     ];
-    (any::<u32>(), any::<u64>(), outcome, vec(any::<u8>(), 0..300), progress(), vec(trace_point(), 0..5))
-        .prop_map(|(walk, assignment, outcome, checkpoint, progress, trace)| {
+    let names = (any::<u32>(), any::<u64>(), option::of(start()));
+    (names, outcome, vec(any::<u8>(), 0..300), progress(), vec(trace_point(), 0..5)).prop_map(
+        |((walk, assignment, start), outcome, checkpoint, progress, trace)| {
             let walk = match &outcome {
                 Outcome::Candidate(candidate) => candidate.id.walk,
                 _ => WalkId(walk),
             };
-            AssignmentReport { walk, assignment, outcome, checkpoint, progress, trace }
-        })
+            AssignmentReport { walk, assignment, start, outcome, checkpoint, progress, trace }
+        },
+    )
+}
+
+fn start() -> impl Strategy<Value = AssignmentStart> {
+    (progress(), any::<u64>(), 1.0..9.0, option::of(verdict())).prop_map(
+        |(progress, mixture_version, threshold_factor, verdict)| AssignmentStart {
+            position: progress.position(),
+            mixture_version,
+            threshold_factor,
+            verdict,
+        },
+    )
 }
 
 fn trace_point() -> impl Strategy<Value = TracePoint> {
