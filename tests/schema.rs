@@ -183,7 +183,7 @@ fn the_schema_takes_and_refuses_what_the_program_does() {
         ("label.method", vasp, true),
         ("stop.max_steps_without_structure", json!(1000), true),
         ("stop.max_steps_without_structure", json!(0), false),
-        ("stop.walks", json!(["hot"]), true),
+        ("stop.walks", json!([]), true),
         ("stop.walks", json!("hot"), false),
         ("stop.min_improvement", json!(-0.1), false),
         ("launch", json!({ "custom": { "name": "PBS" } }), false),
