@@ -8,7 +8,7 @@ use std::time::Duration;
 use serde_json::{Value, json};
 
 use crate::common::campaign::{Outcome, Small, outcome};
-use crate::common::processes::signal;
+use crate::common::processes::{processes_running, signal, wait_until};
 use crate::common::{Running, calmwalk, program, refuse, stderr, succeed, write_frames};
 
 /// Two volumes at the start with a biased cell, and one walk under pressure without.
@@ -29,6 +29,9 @@ cell_bias = false
 const KEYS: &str =
     "reference_steps = 40\n[walk.cell_bias]\nwindow = 20\ngain = 0.05\nend_after_collected = 1000\n";
 
+/// Number of times that a campaign is interrupted.
+const INTERRUPTIONS: u64 = 4;
+
 /// Writes a small campaign without a volume ramp, with these keys at the end of `[walk]` and these groups.
 fn write(here: &Path, walkers: usize, keys: &str, groups: &str) {
     let config = Small { walkers, steps: 120, max_per_walk: 2, ..Small::default() }.write(here);
@@ -44,7 +47,7 @@ fn a_campaign_outlives_walks_whose_cells_are_torn_apart() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let groups =
-        "[[walks]]\nname = \"torn\"\npressures = [-1e6]\n[[walks]]\nname = \"whole\"\npressures = [1.0]\n";
+        "[[walks]]\nname = \"torn\"\npressures = [-9e6]\n[[walks]]\nname = \"whole\"\npressures = [1.0]\n";
     write(here, 2, "reference_steps = 0\n", groups);
     succeed(here, ["run", "campaign.toml"]);
     let status: Value = serde_json::from_str(&succeed(here, ["status", "campaign", "--json"])).unwrap();
@@ -95,11 +98,11 @@ fn a_biased_cell_needs_a_volume() {
 fn interruptions_of_reference_runs_change_nothing() {
     let written = || {
         let directory = tempfile::tempdir().unwrap();
-        write(directory.path(), 1, &KEYS.replace("= 40", "= 1500"), GROUPS);
+        write(directory.path(), 1, &KEYS.replace("= 40", "= 400"), GROUPS);
         let config = directory.path().join("campaign.toml");
         let text = fs::read_to_string(&config).unwrap();
         assert!(text.contains("steps_per_assignment = 40\n"));
-        fs::write(&config, text.replace("steps_per_assignment = 40\n", "steps_per_assignment = 200\n"))
+        fs::write(&config, text.replace("steps_per_assignment = 40\n", "steps_per_assignment = 100\n"))
             .unwrap();
         directory
     };
@@ -112,8 +115,9 @@ fn interruptions_of_reference_runs_change_nothing() {
         let mut command = program(here);
         let command = command.args(["run", "campaign.toml"]).stdout(Stdio::null()).stderr(Stdio::null());
         let mut running = Running(command.spawn().unwrap());
-        if interruptions < 6 {
-            std::thread::sleep(Duration::from_millis(500 + 130 * interruptions));
+        if interruptions < INTERRUPTIONS {
+            wait_until("a walker runs", || !processes_running(here, "walker").is_empty());
+            std::thread::sleep(Duration::from_millis(100 + 50 * interruptions));
             signal(running.0.id(), "INT");
             interruptions += 1;
         }
@@ -122,7 +126,7 @@ fn interruptions_of_reference_runs_change_nothing() {
             code => assert!(matches!(code, Some(130) | None), "{code:?}"),
         }
     }
-    assert_eq!(interruptions, 6, "the campaign ended before it was interrupted often enough");
+    assert_eq!(interruptions, INTERRUPTIONS, "the campaign ended before it was interrupted often enough");
     assert_eq!(outcome(&here.join("campaign")), expected);
 }
 

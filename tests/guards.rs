@@ -219,5 +219,5 @@ fn a_wall_needs_a_cluster() {
     assert!(said.contains("guard.wall") && said.contains("every seed structure is periodic"), "{said}");
     fs::write(here.join("campaign.toml"), text.replace("wall = {}", "wall = { margin = 0.0 }")).unwrap();
     let said = refuse(here, ["validate", "campaign.toml"]);
-    assert!(said.contains("guard.wall.margin is 0"), "{said}");
+    assert!(said.contains("guard.wall.margin: found 0"), "{said}");
 }

@@ -226,10 +226,10 @@ fn the_recipe_of_a_warm_start_works() {
         (found.unwrap(), imported.or(status["imported"].as_u64()))
     };
     // The first run creates the campaign, and the second goes on with what it knows.
-    let (before, _) = with_labels(1);
+    let (before, _) = with_labels(2);
     let printed = succeed(here, ["import", "own", "known.extxyz"]);
     assert!(printed.starts_with("imported 20 "), "{printed}");
-    let (after, imported) = with_labels(4);
+    let (after, imported) = with_labels(6);
     assert!(before == 1 && after > before && imported == Some(20), "{before} {after} {imported:?}");
     succeed(here, ["export", "own", "--output", "dataset.extxyz", "--imported"]);
     let frames = read_extxyz(&here.join("dataset.extxyz")).unwrap();

@@ -142,7 +142,11 @@ async fn run(
     let (reason, figures) = match judged {
         Ok(None) => return Ok(RefitOutcome::Stopped),
         Ok(Some(judged)) => judged,
-        Err(RefitFailure::Refused(reason)) => (Some(reason), Value::Null),
+        Err(RefitFailure::Refused(reason)) => {
+            // A file that changed meanwhile is no reason to refuse a version.
+            check_files(config)?;
+            (Some(reason), Value::Null)
+        }
         Err(RefitFailure::Failed(error)) => return Err(error),
     };
     refit.record(reason, figures).await

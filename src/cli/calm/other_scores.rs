@@ -11,7 +11,7 @@ use calm::neighbourhood::PairError;
 use calm::{NeighbourWeights, neighbourhood_average};
 use potentials::grace::PullBack;
 
-use super::scorer::Scorer;
+use super::scorer::{ScoreError, Scorer};
 use crate::calm_validation::labelled::ScoreColumn;
 use crate::calm_validation::{AtomScore, BaselineScore, score_own_features};
 use crate::cli::CommandError;
@@ -42,6 +42,9 @@ struct Scores {
 /// Why a structure cannot be scored.
 #[derive(Debug, thiserror::Error)]
 pub enum OtherScoreError {
+    /// It cannot be graded.
+    #[error(transparent)]
+    Score(#[from] ScoreError),
     #[error(transparent)]
     Features(#[from] FeatureError),
     #[error(transparent)]
@@ -57,7 +60,11 @@ pub enum OtherScoreError {
 impl OtherScoreError {
     /// Whether other structures may be scored.
     pub fn is_of_structure(&self) -> bool {
-        matches!(self, Self::Features(error) if error.is_of_structure())
+        match self {
+            Self::Score(error) => error.is_of_structure(),
+            Self::Features(error) => error.is_of_structure(),
+            _ => false,
+        }
     }
 }
 

@@ -9,7 +9,7 @@ use atoms::extxyz::{Column, ColumnData, ExtxyzValue, Frame, write_frame};
 use calm::{Artifact, NeighbourWeights};
 use npyz::{NpyWriter, WriterBuilder};
 
-use super::other_scores::OtherScores;
+use super::other_scores::{OtherScoreError, OtherScores};
 use super::score_calibration::{self, ScoreCalibration};
 use super::score_labels::ScoreLabels;
 use super::scorer::Scorer;
@@ -120,15 +120,8 @@ impl CalmScoreArgs {
         let (mut count, mut left_out) = (0_u64, LeftOutStructures::default());
         while let Some((mut frame, _)) = frames.next()? {
             let line = frame.line;
-            match scorer.score(&frame.structure, self.gradient) {
-                Ok(()) => (),
-                Err(error) if error.is_of_structure() => {
-                    left_out.add(self.place(line), error);
-                    continue;
-                }
-                Err(error) => return Err(self.at(line, error)),
-            }
-            let columns = match others.columns(&frame.structure, &scorer) {
+            let graded = scorer.score(&frame.structure, self.gradient).map_err(OtherScoreError::from);
+            let columns = match graded.and_then(|()| others.columns(&frame.structure, &scorer)) {
                 Ok(columns) => columns,
                 Err(error) if error.is_of_structure() => {
                     left_out.add(self.place(line), error);

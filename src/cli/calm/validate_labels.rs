@@ -148,15 +148,8 @@ fn each_frame(
             return Ok(false);
         }
         let place = FileLine { file: file.path, line: frame.line };
-        match scorer.score(&frame.structure, false) {
-            Ok(()) => (),
-            Err(error) if error.is_of_structure() => {
-                left_out.add(place, error);
-                continue;
-            }
-            Err(error) => return Err(place.wrong(error)),
-        }
-        match add(scorer, &frame) {
+        let graded = scorer.score(&frame.structure, false).map_err(|error| AddError::Scores(error.into()));
+        match graded.and_then(|()| add(scorer, &frame)) {
             Ok(()) => count += 1,
             Err(AddError::Scores(error)) if error.is_of_structure() => left_out.add(place, error),
             Err(AddError::Scores(error)) => return Err(place.wrong(error)),

@@ -17,7 +17,8 @@ export function comparison({ biased_against_control: compared, large }) {
     element("p", {}, "Matched: a labelled candidate of a biased walk and the labelled frame of its control walk at the same step. Pooled: all "
       + "labelled structures, with a partner or without."),
     element("ul", {}, compared.notes.map((note) => element("li", {}, statement(note)))),
-    pairs.counts.pairs > 0 && pairTable(pairs, shown.errors), ranges(pairs, shown.errors), groupTable(groups, shown.errors),
+    pairs.counts.pairs > 0 && pairTable(pairs, shown.errors), ranges(pairs, shown.errors), groupTable(groups),
+    errorTable(groups, shown.errors),
     rankTable(groups, thresholds.indexOf(large), large), areas(both, thresholds), elementTable(both, large));
 }
 
@@ -57,15 +58,21 @@ function ranges(pairs, errors) {
   return lines.length > 0 && element("p", {}, `Medians over the pairs for any errors of failed labels: ${lines.join("; ")}.`);
 }
 
-function groupTable(groups, errors) {
-  const inGroups = errors.filter(({ group_key: key }) => key != null && groups.some(([, group]) => group[key].value != null));
+function groupTable(groups) {
   const columns = [["structures"], ["number", true], ["failed", true], ["seed structures", true], ["walks", true], ["mean T (K)", true],
-    ["mean V/V₀", true], ...inGroups.map(({ name }) => [`median ${name}`, true]), ["median MAE for any errors of failed", true]];
+    ["mean V/V₀", true]];
   const rows = groups.map(([name, group]) => [name, whole(group.structures), whole(group.failed), whole(group.units.seed_structures),
-    whole(group.units.walks), decimals(group.mean_temperature, 0), decimals(group.mean_relative_volume, 3),
-    ...inGroups.map(({ group_key: key, digits, factor }) => estimate(group[key], digits, factor)),
-    group.median_force_mae_between ? between(group.median_force_mae_between, 3, 1) : "–"]);
+    whole(group.units.walks), decimals(group.mean_temperature, 0), decimals(group.mean_relative_volume, 3)]);
   return table("Groups of structures", columns, rows);
+}
+
+/** The medians over the structures of each group. */
+function errorTable(groups, errors) {
+  const known = errors.filter(({ group_key: key }) => key != null && groups.some(([, group]) => group[key].value != null));
+  const columns = [["median over structures"], ...known.map(({ name }) => [name, true]), ["MAE for any errors of failed", true]];
+  const rows = groups.map(([name, group]) => [name, ...known.map(({ group_key: key, digits, factor }) => estimate(group[key], digits, factor)),
+    group.median_force_mae_between ? between(group.median_force_mae_between, 3, 1) : "–"]);
+  return table("Errors of structures, by groups", columns, rows);
 }
 
 function rankTable(groups, place, large) {
