@@ -62,7 +62,7 @@ unbiased=$out/unbiased.extxyz
 if [ ! -e "$unbiased" ]; then
     for temperature in 300 500; do
         configured "md-$element-$temperature.toml" "md-$temperature.toml"
-        "$program" md "$out/md-$temperature.toml" --output "$out/md-$temperature.extxyz"
+        "$program" md "$out/md-$temperature.toml" --output "$out/md-$temperature.extxyz" >&2
         # Without the first 4 ps, and without the frame after them.
         frames 11 "$out/md-$temperature.extxyz"
     done > "$out/unbiased.partial"

@@ -147,8 +147,8 @@ fn a_barostat_moves_the_cell_to_its_pressure() {
             frames.iter().map(|frame| frame.structure.cell.volume() / frame.structure.len() as f64).collect();
         let (first, last) = (volumes[0], &volumes[50..]);
         let mean = last.iter().sum::<f64>() / last.len() as f64;
-        let rows = printed.lines().filter(|line| line.trim_start().starts_with("3000 "));
-        let ratio: f64 = rows.last().unwrap().split_whitespace().last().unwrap().parse().unwrap();
+        let last_row = printed.lines().rfind(|line| line.trim_start().starts_with("3000 ")).unwrap();
+        let ratio: f64 = last_row.rsplit(' ').next().unwrap().parse().unwrap();
         assert!((ratio - volumes.last().unwrap() / first).abs() < 1e-4, "{printed}");
         mean
     };
