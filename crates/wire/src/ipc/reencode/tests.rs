@@ -37,7 +37,7 @@ fn content(message: &[u8]) -> &[u8] {
 
 /// Arbitrary content as a control message.
 fn encoded(content: &[u8]) -> Vec<u8> {
-    let control = [b"CALM\x04".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat();
+    let control = [b"CALM\x05".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat();
     frame::to_words(&control, None).as_bytes().to_vec()
 }
 
