@@ -107,7 +107,10 @@ pub fn check_outputs<'a>(
                 "{output} and {other}: one file is named for two outputs"
             )));
         }
-        AtomicFile::create(output).map(drop)?;
+        // A pipe that is opened and closed ends whoever reads it.
+        if !fs::metadata(output).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
+            AtomicFile::create(output).map(drop)?;
+        }
     }
     Ok(())
 }

@@ -9,11 +9,13 @@ use std::sync::Arc;
 use calm::Mixture;
 use orchestrator::selector::VERSION;
 use potentials::grace::Threads;
+use serde_json::Value;
 use store::{AssignmentRecord, LoggedDecision, Store, StoredCandidate, WalkRecord};
 use wire::messages::{Assignment, AssignmentReport, Outcome, PathPosition, WalkProgress};
 use wire::{Candidate, CandidateBlock, Origin, WalkId};
 use workers::walk::{StepView, WalkContext, advance_observed};
 
+use crate::atomic_file::refuse_to_replace;
 use crate::campaign;
 use crate::config::Config;
 use crate::exit_status::CommandError;
@@ -37,15 +39,16 @@ pub struct RerunSummary {
 }
 
 /// Runs a walk again up to its last report. Calls `on_step` at its start and after each of its steps, and stops early when `stopping`
-/// returns true.
+/// returns true. `output` is a file that will be written.
 ///
 /// # Errors
-/// A walk without a record, files that have changed or moved, and a step that is not that of the record: a candidate with other bits, or
+/// An output that would replace a file of the campaign, a walk without a record, files that have changed or moved, and a step that is not that of the record: a candidate with other bits, or
 /// at another step.
 pub async fn rerun(
     store: &Store,
     walk: WalkId,
     moved: &RelocatedFilesArgs,
+    output: Option<&Path>,
     stopping: &impl Fn() -> bool,
     on_step: impl FnMut(&mut StepView<'_, '_>),
 ) -> Result<RerunSummary, CommandError> {
@@ -57,6 +60,11 @@ pub async fn rerun(
     let copies = tempfile::tempdir().map_err(CommandError::failed)?;
     let begin = taken_up(store, record.conditions.version).await?;
     let config = configuration(store, begin.as_ref(), copies.path(), moved).await?;
+    if let Some(output) = output {
+        let mut files = Vec::new();
+        texts(&replay::resolved(&store.campaign().await?)?, &mut files);
+        refuse_to_replace(output, files.iter().map(|file| (Path::new(file), "a file of the campaign")))?;
+    }
     let (model, artifact, _) = campaign::load_for_grades(&config, Path::new("(the campaign)"))?;
     let mut settings = campaign::walk_settings(&config);
     // These two may have changed since, but change no step.
@@ -67,6 +75,16 @@ pub async fn rerun(
     let mixtures = MixtureStream::open(store, &artifact, begin.as_ref()).await?;
     let assignment = first_assignment(store, &record).await?;
     Rerun { store, context, mixtures, assignment, on_step }.run(&parts, stopping).await
+}
+
+/// All texts in it, among them the names of files.
+fn texts(value: &Value, found: &mut Vec<String>) {
+    match value {
+        Value::String(text) => found.push(text.clone()),
+        Value::Array(all) => all.iter().for_each(|value| texts(value, found)),
+        Value::Object(all) => all.values().for_each(|value| texts(value, found)),
+        _ => {}
+    }
 }
 
 /// The configuration with which the campaign began, with the files of the version of the potential that a decision took up.

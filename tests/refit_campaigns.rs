@@ -403,7 +403,7 @@ fn a_training_that_crashes_is_refused_by_a_live_campaign_alone() {
 const ONE_VERSION: &str = r#"
 [refit]
 replay = ["replay.extxyz"]
-after_structures = 2
+after_structures = 6
 max_versions = 1
 held_out = 0.0
 max_attempts = 1

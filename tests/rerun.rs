@@ -58,7 +58,8 @@ fn written(small: &Small, changes: &[(&str, &str)]) -> TempDir {
 fn check_all(directory: &Path) -> usize {
     let Recorded { walks, candidates, .. } = recorded(directory);
     let before = fs::read(directory.join("here/campaign.sqlite")).unwrap();
-    for walk in &walks {
+    // A walk that was created just before the end has no record.
+    for walk in walks.iter().filter(|walk| walk.assignments > 0) {
         let number = walk.walk.to_string();
         let arguments = ["rerun", "here", &number, "--trajectory", "walk.extxyz.zst", "--every", "1"];
         let said = succeed(directory, arguments);
@@ -106,20 +107,25 @@ fn a_live_campaign_that_was_interrupted_comes_out_bit_by_bit() {
     let small = Small {
         mode: "live",
         walkers: 3,
-        steps: 20_000,
+        steps: 2_400,
         max_per_walk: 1_000,
         seed_structures: &["fcc-100", "fcc-103", "vacancy"],
         ..Small::default()
     };
     let directory = written(&small, &[("steps_per_assignment = 40", "steps_per_assignment = 400")]);
     let here = directory.path();
-    for least in [3, 6, 9] {
+    let mut steps = 0;
+    for least in [0, 0, 3] {
         let mut run =
             Running(program(here).args(RUN).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap());
-        wait_until("candidates", || {
+        wait_until("steps and candidates", || {
             let status = calmwalk(here, ["status", "here", "--json"]);
             let status = serde_json::from_slice::<serde_json::Value>(&status.stdout).unwrap_or_default();
-            status["candidates"]["seen"].as_u64() >= Some(least)
+            let walks = status["walks"].as_array().into_iter().flatten();
+            let made: u64 = walks.filter_map(|walk| walk["step"].as_u64()).sum();
+            let is_further = made > steps && status["candidates"]["seen"].as_u64() >= Some(least);
+            steps = if is_further { made } else { steps };
+            is_further
         });
         signal(run.0.id(), "INT");
         run.0.wait().unwrap();
@@ -128,7 +134,7 @@ fn a_live_campaign_that_was_interrupted_comes_out_bit_by_bit() {
     let is_part = |pair: &&[AssignmentRecord]| pair[0].number == pair[1].number;
     let parts = assignments.iter().map(|walk| walk.windows(2).filter(is_part).count()).sum::<usize>();
     assert!(parts > 0, "no assignment was interrupted");
-    assert!(check_all(here) > 5);
+    assert!(check_all(here) > 2);
 }
 
 #[test]

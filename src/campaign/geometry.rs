@@ -54,3 +54,9 @@ fn median_nearest(structure: &Structure, neighbours: &NeighbourList) -> Option<(
     nearest.sort_by(|a, b| a.1.total_cmp(&b.1));
     nearest.get(nearest.len() / 2).copied()
 }
+
+/// Why the cell of a structure cannot have a bias, which is a stress, if it cannot.
+pub(super) fn cell_bias_fault(structure: &Structure) -> Option<&'static str> {
+    let fault = "the lattice vectors do not span space, so the cell has no volume on which a stress could act: give it a third vector";
+    (structure.cell.volume() == 0.0).then_some(fault)
+}

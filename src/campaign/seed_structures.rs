@@ -13,9 +13,8 @@ use potentials::ModelWithFeatures;
 use toml::Spanned;
 use wire::ContentHash;
 
-use super::geometry::Geometry;
+use super::geometry::{Geometry, cell_bias_fault};
 use super::loader::Loader;
-use super::walk_plan::cell_bias_fault;
 use crate::all_cores;
 use crate::config::{ConfigError, OnInvalid, WalkSection, Warning, location};
 

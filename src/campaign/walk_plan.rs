@@ -8,6 +8,7 @@ use md::BarostatSettings;
 use orchestrator::selector::SeedStructurePlan;
 use wire::{ConstantPressure, WalkConditions};
 
+use super::geometry::cell_bias_fault;
 use super::loader::Loader;
 use super::seed_structures::{SeedStructures, SourcedStructure, listed};
 use crate::config::{
@@ -190,12 +191,6 @@ fn cell_fault(walk: &WalkSection, conditions: &WalkConditions, structure: &Struc
     }
     let fault = cell_bias_fault(structure).filter(|_| constant.cell_bias)?;
     Some(format!("has a bias on the cell: {fault}"))
-}
-
-/// Why the cell of a structure cannot have a bias, which is a stress, if it cannot.
-pub(super) fn cell_bias_fault(structure: &Structure) -> Option<&'static str> {
-    let fault = "the lattice vectors do not span space, so the cell has no volume on which a stress could act: give it a third vector";
-    (structure.cell.volume() == 0.0).then_some(fault)
 }
 
 /// A volume ramp, or a constant pressure, or neither.

@@ -74,7 +74,10 @@ impl RerunArgs {
         let store = Store::open_read_only(&self.location.get()?).await?;
         let stopping = || stop.is_cancelled() || output.has_failed.get();
         let found =
-            rerun(&store, WalkId(self.walk), &self.moved, &stopping, |step| output.observe(step)).await;
+            rerun(&store, WalkId(self.walk), &self.moved, self.trajectory.as_deref(), &stopping, |step| {
+                output.observe(step)
+            })
+            .await;
         store.close().await;
         found
     }

@@ -120,24 +120,24 @@ impl NativeTraining<'_> {
     }
 }
 
-/// Warns if validation has replay data alone: the labels of the campaign belong to one seed structure, which is not divided.
+/// Warns if validation has replay data alone: the labels of the campaign belong to so few seed structures that none is held out.
 fn warn_of_validation(data: &TrainingData, labels: usize, warn: &dyn Fn(String)) {
     if !data.validation.is_empty() && data.validation.iter().all(|frame| frame.file != labels) {
         warn(
-            "the validation set has replay data alone, since the labels to train on belong to one seed structure: the weights are \
+            "the validation set has replay data alone, since the labels to train on belong to too few seed structures: the weights are \
              chosen without them. refit.method.native.validation_share = 0 takes the last weights"
                 .to_owned(),
         );
     }
 }
 
-/// Names the files of these directories by their names, so that a record does not depend on where they are.
+/// Names the files of these directories by their names, so that a record does not depend on where they are. A directory may lie in another one.
 fn without_directories(spread: EnergyDeviations, directories: &[PathBuf]) -> EnergyDeviations {
     let short = |place: String| {
-        let inside = directories.iter().find_map(|directory| {
-            place.strip_prefix(directory.to_str()?)?.strip_prefix('/').map(str::to_owned)
-        });
-        inside.unwrap_or(place)
+        let inside = directories
+            .iter()
+            .filter_map(|directory| place.strip_prefix(directory.to_str()?)?.strip_prefix('/'));
+        inside.min_by_key(|name| name.len()).map(str::to_owned).unwrap_or(place)
     };
     let far = spread.far.into_iter().map(|far| FarStructure { place: short(far.place), ..far });
     EnergyDeviations { far: far.collect(), ..spread }
@@ -224,7 +224,7 @@ mod tests {
         let places = ["/a/refit/1/train.extxyz:7 (candidate x/1)", "/b/replay.xyz:1", "other.xyz:3"];
         let far = places.map(|place| FarStructure { place: place.to_owned(), difference: 1.0 });
         let spread = EnergyDeviations { far: far.to_vec(), ..EnergyDeviations::default() };
-        let found = without_directories(spread, &["/b".into(), "/a/refit/1".into()]);
+        let found = without_directories(spread, &["/b".into(), "/a".into(), "/a/refit/1".into()]);
         let found: Vec<_> = found.far.iter().map(|far| far.place.as_str()).collect();
         assert_eq!(found, ["train.extxyz:7 (candidate x/1)", "replay.xyz:1", "other.xyz:3"]);
     }

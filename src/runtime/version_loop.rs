@@ -7,8 +7,9 @@ use std::sync::Arc;
 
 use orchestrator::reactor::RunOutcome;
 use orchestrator::selector::{CampaignMode, Selector, SelectorSettings, SelectorSnapshot};
-use store::{Store, unix_milliseconds};
+use store::{Store, WalkRecord, unix_milliseconds};
 use tokio_util::sync::CancellationToken;
+use workers::walk::has_known_layout;
 
 use super::refit_process::RefitProcess;
 use super::single_process::write_heartbeats;
@@ -16,7 +17,7 @@ use super::{RunContext, RunMode, STOP_MESSAGE, run_walks};
 use crate::campaign::LoadedCampaign;
 use crate::config::RefitSection;
 use crate::exit_status::CommandError;
-use crate::output::log_and_print;
+use crate::output::{count, log_and_print};
 use crate::refit::schedule::RefitSchedule;
 use crate::signals::cancel_on_signal;
 use crate::versions::VersionOnDisk;
@@ -120,8 +121,10 @@ pub async fn in_force(
 
 /// The selector with the state in the store. New walks are started.
 pub async fn restore_selector(campaign: &LoadedCampaign, store: &Store) -> Result<Selector, CommandError> {
+    let walks = store.load_walks().await?;
+    check_layout(&walks)?;
     let snapshot = SelectorSnapshot {
-        walks: store.load_walks().await?,
+        walks,
         components: store.load_components().await?,
         known: store.known_hashes().await?,
         imported: store.status().await?.imported,
@@ -138,10 +141,29 @@ pub async fn restore_selector(campaign: &LoadedCampaign, store: &Store) -> Resul
     )
     .map_err(CommandError::failed)?;
     let started = selector.start_walks();
+    // Those that continue because a limit was raised, or a version refused.
+    check_layout(&started.walks)?;
     if !started.decisions.is_empty() {
         store.commit(&started).await?;
     }
     Ok(selector)
+}
+
+/// Refuses walks that another version of calmwalk began and that have steps to make.
+fn check_layout(walks: &[WalkRecord]) -> Result<(), CommandError> {
+    let is_foreign = |walk: &&WalkRecord| {
+        walk.is_active() && walk.checkpoint.as_ref().is_some_and(|checkpoint| !has_known_layout(checkpoint))
+    };
+    let foreign: Vec<_> = walks.iter().filter(is_foreign).collect();
+    match foreign.first() {
+        None => Ok(()),
+        Some(first) => Err(CommandError::Input(format!(
+            "another version of calmwalk began {} of this campaign (the first is walk {}), and this version cannot read their checkpoints: \
+             start another campaign; `calmwalk import` takes over what is labelled",
+            count(foreign.len() as u64, "walk"),
+            first.walk.0
+        ))),
+    }
 }
 
 /// Number of accepted structures at which walks make room for a refit. Walks of a live campaign continue beside it, until its last
@@ -155,4 +177,36 @@ async fn refit_at(campaign: &LoadedCampaign, store: &Store) -> Result<Option<u32
     }
     let number = schedule.refit_at(refit);
     Ok(number.map(|number| number.min(u32::MAX.into()) as u32))
+}
+
+#[cfg(test)]
+mod tests {
+    use wire::messages::WalkProgress;
+    use wire::{Origin, WalkConditions, WalkId};
+
+    use super::*;
+
+    #[test]
+    fn walks_of_another_version_of_calmwalk_are_refused_while_they_have_steps_to_make() {
+        let walk = |state: &str, checkpoint: Option<&[u8]>| WalkRecord {
+            walk: WalkId(3),
+            origin: Origin::Biased,
+            partner: None,
+            seed_structure: 0,
+            conditions: WalkConditions::default(),
+            state: state.into(),
+            reason: String::new(),
+            assignments: 1,
+            accepted: 0,
+            progress: WalkProgress::default(),
+            selector_state: String::new(),
+            checkpoint: checkpoint.map(<[u8]>::to_vec),
+        };
+        let fine = [walk("waiting", None), walk("completed", Some(b"older"))];
+        assert!(check_layout(&fine).is_ok());
+        let Err(CommandError::Input(message)) = check_layout(&[walk("running", Some(b"older"))]) else {
+            panic!("accepted")
+        };
+        assert!(message.contains("began 1 walk of this campaign (the first is walk 3)"), "{message}");
+    }
 }

@@ -226,6 +226,18 @@ pub struct WalkRecord {
     pub checkpoint: Option<Vec<u8>>,
 }
 
+/// Whether a walk in this state has more steps to make.
+pub(crate) fn is_active_state(state: &str) -> bool {
+    matches!(state, "waiting" | "running")
+}
+
+impl WalkRecord {
+    /// Whether it has more steps to make.
+    pub fn is_active(&self) -> bool {
+        is_active_state(&self.state)
+    }
+}
+
 /// Everything that one transaction commits before the walkers get their replies.
 #[derive(Clone, Debug, Default)]
 pub struct Commit {

@@ -9,6 +9,7 @@ use crate::database::{FromRow, SqlRow};
 use crate::error::Result;
 use crate::jobs::OldestLease;
 use crate::processes::ProcessRecord;
+use crate::records::is_active_state;
 
 /// Everything that `status` shows.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -152,7 +153,7 @@ pub struct WalkStatus {
 impl WalkStatus {
     /// Whether it has more steps to make.
     pub fn is_active(&self) -> bool {
-        matches!(self.state.as_str(), "waiting" | "running")
+        is_active_state(&self.state)
     }
 }
 

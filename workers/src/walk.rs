@@ -31,6 +31,7 @@ use crate::guard;
 use crate::settings::WalkSettings;
 use error::WalkError;
 use start::start;
+pub use state::has_known_layout;
 use state::{GoodState, WalkState};
 pub use step_view::StepView;
 
@@ -153,7 +154,7 @@ impl<'a> RunningWalk<'a> {
         let (dynamics, state) = match &assignment.checkpoint {
             None => start(settings, assignment, &mut potential)?,
             Some(bytes) => {
-                let state: WalkState = postcard::from_bytes(bytes)?;
+                let state: WalkState = WalkState::decode(bytes)?;
                 let cutoff = atoms::Potential::cutoff(&potential);
                 (Dynamics::resume(state.dynamics.clone(), cutoff, settings.skin)?, state)
             }
@@ -389,7 +390,7 @@ impl<'a> RunningWalk<'a> {
     fn encode(&mut self) -> Vec<u8> {
         self.state.dynamics = self.dynamics.checkpoint().clone();
         self.state.bias = self.potential.state;
-        postcard::to_stdvec(&self.state).expect("plain data is encoded into memory")
+        self.state.encode()
     }
 }
 

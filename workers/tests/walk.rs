@@ -16,7 +16,7 @@ use wire::{CampaignId, Candidate, Origin, WalkConditions, WalkId};
 use workers::bias::BiasedPotential;
 use workers::cell_bias::CellBiasSettings;
 use workers::settings::{GuardSettings, WalkSettings};
-use workers::walk::{WalkContext, advance};
+use workers::walk::{WalkContext, advance, has_known_layout};
 
 use crate::mutate;
 
@@ -161,6 +161,26 @@ fn a_walk_begins_at_the_volume_of_its_ramp() {
     for (a, b) in found.positions.iter().zip(&expected.positions) {
         assert!(cell::norm(cell::sub(*a, *b)) < 1e-6, "{a:?} {b:?}");
     }
+}
+
+/// A checkpoint that an earlier build wrote, after 110 steps of the walk below, stays readable. If it does not, the layout has
+/// changed: it needs another number (`LAYOUT`) and another file here, `now`.
+#[test]
+fn checkpoints_keep_their_layout() {
+    let settings = WalkSettings { collection: never(), ..settings() };
+    let mut next = assignment(seed_structure("vacancy"), 110);
+    let now = run(&settings, &next).checkpoint;
+    let kept = include_bytes!("data/walk.checkpoint").to_vec();
+    assert!(has_known_layout(&kept) && has_known_layout(&now));
+    assert!(!has_known_layout(&kept[1..]));
+    let [kept, now] = [kept, now].map(|checkpoint| {
+        (next.number, next.last_step, next.checkpoint) = (1, 130, Some(checkpoint));
+        run(&settings, &next)
+    });
+    assert!(matches!(kept.outcome, Outcome::StepsDone) && kept.progress.step == 130, "{:?}", kept.outcome);
+    // Other instruction sets have other last bits.
+    let (kept, now) = (kept.progress.gamma_max, now.progress.gamma_max);
+    assert!((kept / now - 1.0).abs() < 1e-6, "{kept} {now}");
 }
 
 /// A damaged checkpoint continues or ends its walk. `CALMWALK_MUTATIONS=5000` runs the long version.

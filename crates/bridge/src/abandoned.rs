@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 /// Prefix of the names of package directories.
-pub(crate) const PACKAGE_PREFIX: &str = "calmwalk-python-";
+pub(crate) const PACKAGE_PREFIX: &str = "calmwalk-server-";
 /// Prefix and part of the names of arenas.
 pub(crate) const ARENA: (&str, &str) = ("calmwalk-", "-arena-");
 
@@ -67,13 +67,13 @@ mod tests {
         arena.reserve(100).unwrap();
         let package = PackageDir::new_in(here.path()).unwrap();
         let file = |name: &str| here.path().join(name);
-        fs::create_dir(file("calmwalk-python-abc")).unwrap();
-        for name in ["calmwalk-python-file", "calmwalk-12-0-arena-1", "another-12-0-arena-1"] {
+        fs::create_dir(file("calmwalk-server-abc")).unwrap();
+        for name in ["calmwalk-server-file", "calmwalk-12-0-arena-1", "another-12-0-arena-1"] {
             fs::write(file(name), "").unwrap();
         }
         remove_abandoned_in(here.path(), here.path());
         assert!(arena.path().exists() && package.path().exists());
-        assert!(file("calmwalk-python-file").exists() && file("another-12-0-arena-1").exists());
-        assert!(!file("calmwalk-python-abc").exists() && !file("calmwalk-12-0-arena-1").exists());
+        assert!(file("calmwalk-server-file").exists() && file("another-12-0-arena-1").exists());
+        assert!(!file("calmwalk-server-abc").exists() && !file("calmwalk-12-0-arena-1").exists());
     }
 }

@@ -134,12 +134,12 @@ impl Device {
         &self.broken
     }
 
-    /// Evaluates copies of a structure in batches of one, two, four, … of them, up to `most`: frameworks compile, and it is found how many
+    /// Evaluates copies of a structure in batches of one, two, four, … and `most` of them: frameworks compile, and it is found how many
     /// the memory of the device takes. Returns whether each copy has the same bits, whatever the size of the batch. Of use for devices other
     /// than a processor, for frameworks that compile, and where bits matter.
     ///
     /// # Errors
-    /// An element that the model does not support, or an invalid structure.
+    /// An element that the model does not support, an invalid structure, or a server that fails at such a batch.
     pub fn warm_up(&self, structure: &Structure, skin: f64, most: usize) -> Result<bool, String> {
         let description = self.info.description();
         let index = |species: &Species| {
@@ -151,9 +151,9 @@ impl Device {
         list.update(structure).map_err(|error| error.to_string())?;
         let geometry = BondGeometry::from_structure(structure, Topology::from_list(&species, &list, None));
         let (done, ended) = mpsc::sync_channel(1);
-        // A thread that has crashed has refuted nothing.
         let is_sent = self.events.send(DeviceEvent::WarmUp { geometry, most, done }).is_ok();
-        Ok(!is_sent || ended.recv().unwrap_or(true))
+        let outcome = if is_sent { ended.recv().ok() } else { None };
+        outcome.unwrap_or_else(|| Err("the device has ended".to_owned()))
     }
 
     /// A call of a client of this process. Returns when it has its result: energies `[n]`, forces `[n × 3]`, virial `[9]` and

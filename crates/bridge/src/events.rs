@@ -15,7 +15,7 @@ pub(crate) enum DeviceEvent {
     Server { generation: u64, event: ServerEvent },
     /// Evaluate copies of a structure in batches of all sizes, so that programs are compiled and memory is known. `done` gets whether each
     /// copy has the same bits.
-    WarmUp { geometry: BondGeometry, most: usize, done: SyncSender<bool> },
+    WarmUp { geometry: BondGeometry, most: usize, done: SyncSender<Result<bool, String>> },
     /// The device ends.
     Close,
 }

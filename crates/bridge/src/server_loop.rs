@@ -233,7 +233,9 @@ impl ServerLoop<'_> {
         let Some(server) = &mut self.server else { return };
         match server.answer(line, &call, &names) {
             Ok((compiled, seconds)) => {
-                self.schedule.done(now, now.duration_since(call.begun));
+                // Compiling says nothing about how long walkers need.
+                let time = if compiled { Duration::ZERO } else { now.duration_since(call.begun) };
+                self.schedule.done(now, time);
                 self.setup.note(|statistics| statistics.computed += seconds);
                 self.count(&call, &batch, compiled, now);
                 self.deliver(&call, &batch);

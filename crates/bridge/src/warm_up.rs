@@ -16,36 +16,53 @@ use crate::server_loop::ServerLoop;
 type Copied = [Option<TestResult>; 2];
 
 impl ServerLoop<'_> {
-    /// Evaluates batches of one, two, four … copies, at most `most`, and finds how many fit into the memory. Returns whether each copy
-    /// has the bits of the structure alone.
-    pub fn warm_up(&mut self, geometry: &BondGeometry, most: usize) -> bool {
+    /// Evaluates batches of one, two, four … and `most` copies, and finds how many fit into the memory. Returns whether each copy has the bits of
+    /// the structure alone.
+    ///
+    /// # Errors
+    /// A server that fails twice at a batch.
+    pub fn warm_up(&mut self, geometry: &BondGeometry, most: usize) -> Result<bool, String> {
+        if let Some(reason) = &self.given_up {
+            return Err(reason.clone());
+        }
         if self.server.is_none() || !self.sent.is_empty() {
-            return true;
+            return Err("the device was in use before it was prepared".to_owned());
         }
         let mut early = Vec::new();
         let bonds = geometry.shape().bonds;
-        let (mut copies, mut alone, mut are_same) = (1, None, true);
-        while copies <= most.min(self.schedule.max_structures())
-            && (copies == 1 || copies * bonds <= self.schedule.max_bonds())
-        {
+        let (mut copies, mut fitting, mut failed_at) = (1, 1, 0);
+        let (mut alone, mut outcome) = (None, Ok(true));
+        loop {
+            let top = most.min(self.schedule.max_structures());
+            if copies > top || (copies > 1 && copies * bonds > self.schedule.max_bonds()) {
+                break;
+            }
             (self.progress)(&format!("preparing batches of {copies}"));
             match self.evaluate_copies(geometry, copies, &mut early) {
                 Ok(results) => {
                     let first = alone.get_or_insert_with(|| results[0].clone());
-                    are_same &= results.iter().all(|one| one == first);
-                    copies *= 2;
+                    let are_same = results.iter().all(|one| one == first);
+                    outcome = outcome.map(|all| all && are_same);
+                    fitting = copies;
+                    // The largest batch is one of its own, whatever its number.
+                    copies = if copies < top { top.min(2 * copies) } else { top + 1 };
                 }
                 Err(short @ (ServerFault::Memory(_) | ServerFault::Arena(_))) if copies > 1 => {
                     info!(
                         message = short.message(),
                         copies, "the memory of the device takes fewer structures"
                     );
-                    self.limit_bonds(bonds * copies / 2, matches!(short, ServerFault::Memory(_)));
+                    self.limit_bonds(bonds * fitting, matches!(short, ServerFault::Memory(_)));
                     break;
                 }
                 Err(fault) => {
+                    let message = fault.message().to_owned();
                     self.restart(fault, Vec::new());
-                    break;
+                    if failed_at == copies || self.server.is_none() {
+                        outcome = Err(message);
+                        break;
+                    }
+                    failed_at = copies;
                 }
             }
         }
@@ -53,7 +70,7 @@ impl ServerLoop<'_> {
             // A device that was closed meanwhile learns so again from its channel.
             self.handle(event);
         }
-        are_same
+        outcome
     }
 
     /// One batch in each slot: walkers have the device keep two evaluations at a time. Returns the results of all copies.

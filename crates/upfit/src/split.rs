@@ -10,10 +10,14 @@ use crate::error::UpfitError;
 /// Stands for the split among the uses of the random seed; epochs have the numbers from 0.
 const SPLIT: u64 = u64::MAX;
 
+/// The most that a part of the frames may lose to validation, if the share asked for is smaller.
+const MAX_LOST: f64 = 0.25;
+
 /// Takes about this share of the frames for validation: whole groups (seed structures) in random order, each that still fits, but
 /// not all. If none fits, the smallest group is taken, the first such in that order. Each file is divided by itself, so that a large
 /// file of small groups does not take the place of a small one of large groups. Files of which the share is less than one frame are
-/// divided together, and so are those with a single group. The choice is a function of the order of the groups and of `seed`. With a
+/// divided together, and so are those with a single group. A part whose smallest group is more than a quarter of it is left whole, unless that is so
+/// of all. The choice is a function of the order of the groups and of `seed`. With a
 /// share of 0 there is no validation.
 ///
 /// # Errors
@@ -31,10 +35,20 @@ pub fn split(frames: Vec<LabelledFrame>, share: f64, seed: u64) -> Result<Traini
         return Err(UpfitError::OneGroup { share, structures, group });
     }
     let mut is_validation = vec![false; frames.len()];
-    for (stream, part) in (0..=SPLIT).rev().zip(parts(&groups, share)) {
-        for group in held_out(&part, share, (seed, stream)) {
-            group.frames.iter().for_each(|&frame| is_validation[frame] = true);
-        }
+    let parts = parts(&groups, share);
+    let held: Vec<_> = (0..=SPLIT)
+        .rev()
+        .zip(&parts)
+        .map(|(stream, part)| {
+            let held = held_out(part, share, (seed, stream));
+            (number_of_frames(&held) as f64 / number_of_frames(part) as f64, held)
+        })
+        .collect();
+    // A part of few large groups loses none of them if there is another part to validate with.
+    let least = held.iter().map(|(lost, _)| *lost).fold(f64::INFINITY, f64::min);
+    let bearable = held.into_iter().filter(|(lost, _)| *lost <= MAX_LOST.max(share).max(least));
+    for group in bearable.flat_map(|(_, held)| held) {
+        group.frames.iter().for_each(|&frame| is_validation[frame] = true);
     }
     let mut data = TrainingData::default();
     for (frame, is_validation) in frames.into_iter().zip(is_validation) {
@@ -179,6 +193,9 @@ mod tests {
                 ((200, 1), (80, 10), [20, 10]),
                 ((40, 1), (60, 15), [4, 15]),
                 ((40, 1), (200, 10), [4, 20]),
+                // Few large ones lose too much.
+                ((1000, 1), (30, 15), [100, 0]),
+                ((40, 1), (8, 4), [4, 0]),
                 // A single seed structure is not divided.
                 ((40, 1), (30, 30), [4, 0]),
             ] {

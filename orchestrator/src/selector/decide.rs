@@ -276,8 +276,8 @@ impl DecisionState {
         });
     }
 
-    /// The first applicable reason to decline, in the order too close, duplicate, budget, covered, backlog. Only what none of
-    /// them applies to can be unlikely to complete.
+    /// The first applicable reason to decline, in the order of the checks below. Only what none of them applies to can be unlikely to
+    /// complete.
     fn reason_to_decline(
         &self,
         id: WalkId,

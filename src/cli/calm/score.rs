@@ -146,7 +146,7 @@ impl CalmScoreArgs {
             bar.set(bytes.load(Ordering::Relaxed), || output::count(count, "frame"));
         }
         drop(bar);
-        self.warn(&left_out, count)?;
+        self.warn(&left_out, frames.left_out(), count)?;
         matrix.map_or(Ok(()), NpyWriter::finish).map_err(cannot)?;
         feature_file.map_or(Ok(()), AtomicFile::finish)?;
         output.finish()?;
@@ -181,10 +181,11 @@ impl CalmScoreArgs {
         if is_plain_extxyz(&self.input) { Ok(()) } else { refuse_to_replace(&self.output, [input]) }
     }
 
-    /// Warns of structures that were left out. If the output replaces the input, they would be lost.
-    fn warn(&self, left_out: &LeftOutStructures, kept: u64) -> Result<(), CommandError> {
+    /// Warns of structures that cannot be graded. Refuses an output that would replace the input if these, or others that do not match the filter,
+    /// would be lost.
+    fn warn(&self, left_out: &LeftOutStructures, filtered: u64, kept: u64) -> Result<(), CommandError> {
         left_out.warn(kept)?;
-        if left_out.count() == 0 {
+        if left_out.count() + filtered == 0 {
             return Ok(());
         }
         refuse_to_replace(

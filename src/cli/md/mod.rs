@@ -21,7 +21,7 @@ const BAR: &str = "{bar:32} {pos}/{len} steps  {eta} left  {msg}";
 
 /// Run unbiased molecular dynamics with any supported potential
 ///
-/// Writes an extended XYZ trajectory with energy (eV), forces (eV/Å), stress (eV/Å³, tension positive, without the kinetic
+/// Writes a trajectory, extended XYZ or a LAMMPS dump as its name says, with energy (eV), forces (eV/Å), stress (eV/Å³, tension positive, without the kinetic
 /// part), momenta (in the units of ASE), step, time_fs and temperature (K; 3n − 3 degrees of freedom if the momentum is
 /// conserved, 3n with Langevin). With dynamics.barostat, the lines of progress have the pressure (GPa, that of the atoms'
 /// motion included) and the volume relative to that at the start. On Ctrl-C or SIGTERM, writes the last step and exits.
@@ -31,7 +31,7 @@ pub struct MdArgs {
     #[arg(value_name = "CONFIG")]
     config: PathBuf,
     /// Trajectory file [default: output.trajectory of the configuration]
-    #[arg(long, short, value_name = "FILE.extxyz")]
+    #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
 }
 

@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use wire::WalkId;
 use wire::messages::{AssignmentStart, PathPosition, Verdict};
 
-use crate::Store;
 use crate::checksum::{ASSIGNMENT, Names, REFERENCE_VOLUME};
 use crate::database::{FromRow, SqlRow, SqlValue, Transaction, execute_rows, query};
 use crate::encoding::integer;
@@ -15,7 +14,7 @@ use crate::records::{AssignmentRecord, Commit};
 /// Rows verified at a time.
 const PAGE: u32 = 500;
 
-const TABLE: &str = "assignment";
+pub(super) const TABLE: &str = "assignment";
 const COLUMNS: [&str; 13] = [
     "walk",
     "part",
@@ -37,20 +36,6 @@ const VOLUMES: &str = "reference_volume";
 const VOLUME_COLUMNS: [&str; 3] = ["walk", "volume", "checksum"];
 const INSERT_VOLUMES: &str = "INSERT INTO reference_volume ({columns}) SELECT * FROM {rows} WHERE TRUE
     ON CONFLICT (walk) DO NOTHING";
-
-impl Store {
-    /// The assignments of a walk, in order. Empty for walks that began under earlier versions.
-    pub async fn assignments(&self, walk: WalkId) -> Result<Vec<AssignmentRecord>> {
-        let mut transaction = self.database.begin_read().await?;
-        let mut found = Vec::new();
-        if transaction.has_table(TABLE).await? {
-            let rows = query("SELECT * FROM assignment WHERE walk = $1 ORDER BY part").bind(walk.0);
-            found = rows.fetch_all(&mut transaction).await?;
-        }
-        transaction.commit().await?;
-        Ok(found)
-    }
-}
 
 /// V₀ of the walks that have one, within a transaction.
 pub(super) async fn reference_volumes(transaction: &mut Transaction) -> Result<BTreeMap<u32, f64>> {

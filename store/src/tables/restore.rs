@@ -3,7 +3,7 @@
 use wire::messages::{DeclineReason, WalkProgress};
 use wire::{CandidateBlock, ContentHash, Origin, WalkConditions, WalkId};
 
-use super::walk_conditions;
+use super::{assignments, walk_conditions};
 use crate::Store;
 use crate::checksum::{
     CANDIDATE, CHECKPOINT, COMPONENT, DECISION, LONG_COLUMNS, Names, STRUCTURE, VALUE, WALK, joined,
@@ -12,7 +12,9 @@ use crate::database::{FromRow, SqlRow, Target, from_columns, query};
 use crate::encoding::decode_hash;
 use crate::error::{Result, StoreError};
 use crate::numbers::decode_numbers;
-use crate::records::{AtomGrades, ComponentRecord, Fate, NewestMixture, StoredCandidate, WalkRecord};
+use crate::records::{
+    AssignmentRecord, AtomGrades, ComponentRecord, Fate, NewestMixture, StoredCandidate, WalkRecord,
+};
 
 macro_rules! candidates {
     ($rest:literal) => {
@@ -107,6 +109,18 @@ impl Store {
         if let Some(found) = &mut found {
             let mut conditions = walk_conditions::read(&mut transaction).await?;
             found.conditions = conditions.remove(&walk).unwrap_or_default();
+        }
+        transaction.commit().await?;
+        Ok(found)
+    }
+
+    /// The assignments of a walk, in order. Empty for walks that began under earlier versions.
+    pub async fn assignments(&self, walk: WalkId) -> Result<Vec<AssignmentRecord>> {
+        let mut transaction = self.database.begin_read().await?;
+        let mut found = Vec::new();
+        if transaction.has_table(assignments::TABLE).await? {
+            let rows = query("SELECT * FROM assignment WHERE walk = $1 ORDER BY part").bind(walk.0);
+            found = rows.fetch_all(&mut transaction).await?;
         }
         transaction.commit().await?;
         Ok(found)

@@ -24,6 +24,8 @@ pub(super) enum WalkError {
     Zbl(#[from] ZblRangeError),
     #[error("the walk's checkpoint cannot be read: {0}")]
     Checkpoint(#[from] postcard::Error),
+    #[error("the walk's checkpoint cannot be read: another version of calmwalk wrote it")]
+    CheckpointLayout,
     #[error(
         "the bulk modulus of the seed structure is {0:.1} GPa: it is not stable; give walk.cell_bias.stress_scale"
     )]

@@ -7,6 +7,16 @@ use serde::{Deserialize, Serialize};
 use crate::bias::{BiasState, BiasedPotential};
 use crate::cell_bias::CellBias;
 use crate::settings::WalkSettings;
+use crate::walk::error::WalkError;
+
+/// What a checkpoint begins with. Its bytes have no names of fields, so that those of another layout would be misread: give this another number
+/// whenever a type in [`WalkState`] changes.
+const LAYOUT: &[u8] = b"calmwalk walk 2\n";
+
+/// Whether this version of calmwalk can read a checkpoint.
+pub fn has_known_layout(checkpoint: &[u8]) -> bool {
+    checkpoint.starts_with(LAYOUT)
+}
 
 /// Number of checkpoints kept for roll backs. The oldest one is used, so that a roll back leads out of the trap.
 const MAX_CHECKPOINTS: usize = 2;
@@ -77,6 +87,17 @@ pub(super) struct CollectionPoint {
 }
 
 impl WalkState {
+    /// The bytes of a checkpoint.
+    pub fn encode(&self) -> Vec<u8> {
+        postcard::to_extend(self, LAYOUT.to_vec()).expect("plain data is encoded into memory")
+    }
+
+    /// Reads a checkpoint.
+    pub fn decode(checkpoint: &[u8]) -> Result<Self, WalkError> {
+        let content = checkpoint.strip_prefix(LAYOUT).ok_or(WalkError::CheckpointLayout)?;
+        Ok(postcard::from_bytes(content)?)
+    }
+
     /// Keeps the current state as a target of roll backs.
     pub fn keep_checkpoint(&mut self, dynamics: &Dynamics, potential: &BiasedPotential) {
         if self.good.len() == MAX_CHECKPOINTS {
