@@ -206,7 +206,7 @@ fn errors_are_specific() {
         }
     };
     assert_eq!(changed(8), ControlError::Magic(*b"BALM"));
-    assert_eq!(changed(12), ControlError::Version(5));
+    assert_eq!(changed(12), ControlError::Version(4));
     assert!(matches!(changed(13), ControlError::Checksum { .. }));
     assert!(matches!(changed(CONTENT), ControlError::Checksum { .. }));
     let short = |control: &[u8]| super::answer(frame::to_words(control, None).as_bytes());
