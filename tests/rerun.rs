@@ -107,7 +107,7 @@ fn a_live_campaign_that_was_interrupted_comes_out_bit_by_bit() {
     let small = Small {
         mode: "live",
         walkers: 3,
-        steps: 2_400,
+        steps: 1_200,
         max_per_walk: 1_000,
         seed_structures: &["fcc-100", "fcc-103", "vacancy"],
         ..Small::default()
