@@ -107,7 +107,7 @@ pub fn check_outputs<'a>(
                 "{output} and {other}: one file is named for two outputs"
             )));
         }
-        // A pipe that is opened and closed ends whoever reads it.
+        // Opening and closing a pipe would end its reader.
         if !fs::metadata(output).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
             AtomicFile::create(output).map(drop)?;
         }

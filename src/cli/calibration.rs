@@ -39,8 +39,7 @@ fn write_map(out: &mut dyn Write, map: &CalibrationMap, of_two: bool) -> io::Res
     ];
     titles.extend(of_two.then_some("in use"));
     let mut table = TextTable::new(&titles);
-    let several = map.elements().len() > 1;
-    for bin in map.bins.iter().filter(|bin| several || bin.element.is_none()) {
+    for bin in map.distinct_bins() {
         let CalibrationBin {
             element,
             above,

@@ -22,7 +22,7 @@ pub(crate) struct Arena {
     /// Whether the file still has its name.
     is_named: bool,
     map: Option<MmapMut>,
-    /// Holds a lock: what nobody holds was left by a killed program.
+    /// Locked while this program runs, so that other programs do not remove it as abandoned.
     held: Option<File>,
 }
 

@@ -171,4 +171,10 @@ impl CalibrationMap {
         elements.dedup();
         elements
     }
+
+    /// The bins that say something of their own: those of all atoms, and of the elements if there are several.
+    pub fn distinct_bins(&self) -> impl Iterator<Item = &CalibrationBin> {
+        let several = self.elements().len() > 1;
+        self.bins.iter().filter(move |bin| several || bin.element.is_none())
+    }
 }

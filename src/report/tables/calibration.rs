@@ -36,8 +36,7 @@ fn bounds(name: &'static str, map: &CalibrationMap) -> PageTable {
         "in use",
     ];
     let mut table = PageTable::new(name, &caption, &titles);
-    let several = map.elements().len() > 1;
-    for bin in map.bins.iter().filter(|bin| several || bin.element.is_none()) {
+    for bin in map.distinct_bins() {
         let CalibrationBin {
             element,
             above,
