@@ -74,7 +74,7 @@ fn settings(here: &Path, campaign: &str, method: Json) -> Json {
             "replay_weight": 1.0,
             "method": method,
             "held_out": HELD_OUT,
-            "max_seed_error_ratio": 3.0,
+            "max_replay_error_ratio": 3.0,
             "max_held_out_error_ratio": 10.0,
             "threads": 1,
             "start": "parent",
@@ -184,7 +184,7 @@ fn check_version(here: &Path, version: &VersionRecord) {
     let sets = version.figures["sets"].as_array().unwrap();
     let names: Vec<_> =
         sets.iter().map(|set| [&set["name"], &set["kind"]].map(|x| x.as_str().unwrap())).collect();
-    assert_eq!(names, [["cold", "test"], ["held_out", "held_out"], ["seed", "seed"]]);
+    assert_eq!(names, [["cold", "test"], ["held_out", "held_out"], ["replay", "replay"]]);
     let structures: Vec<_> = sets.iter().map(|set| set["structures"].as_u64().unwrap()).collect();
     assert_eq!((structures[0], structures[2]), (3, REPLAY as u64));
     // A structure that a biased and a control walk found is in the export of both.
@@ -267,7 +267,7 @@ fn what_a_program_leaves_is_judged() {
     write_model(&here.join("rough.npz"), "output_scale", |scale| 5.0 * scale);
     let reason = refused(here, &by(&copy_of("rough.npz")));
     assert!(reason.contains("the force MAE on the replay data is "), "{reason}");
-    assert!(reason.contains("expected at most 3 times (refit.max_seed_error_ratio)"), "{reason}");
+    assert!(reason.contains("expected at most 3 times (refit.max_replay_error_ratio)"), "{reason}");
     let all = versions(&here.join("campaign"));
     assert_eq!(all.last().unwrap().figures["sets"].as_array().unwrap().len(), 3);
 }

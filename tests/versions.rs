@@ -104,7 +104,7 @@ fn three_versions(mode: &str) -> TempDir {
             [(1, 0, 3, [0.4, 0.4, 0.3]), (2, 1, 5, [0.5, 0.4, 0.9]), (3, 1, 6, [0.5, 0.4, 0.1])]
         {
             let files = (number != 2).then(|| small_files(number));
-            let sets = json!([set("held_out", held_out, errors), set("seed", 9, [0.02, 0.02, 0.04])]);
+            let sets = json!([set("held_out", held_out, errors), set("replay", 9, [0.02, 0.02, 0.04])]);
             let record = record(number, parent, sets, files.as_ref());
             store.add_version(&record, files.as_ref()).await.unwrap();
         }

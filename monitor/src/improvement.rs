@@ -123,7 +123,7 @@ pub(crate) mod tests {
             (
                 vec![
                     set("test", 5, 1.0, Some(0.5)),
-                    set("seed", 9, 9.0, Some(9.0)),
+                    set("replay", 9, 9.0, Some(9.0)),
                     set("test", 5, 3.0, Some(0.5)),
                 ],
                 Some([2.0, 0.5]),

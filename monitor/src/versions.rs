@@ -63,7 +63,7 @@ pub struct VersionSummary {
 pub struct VersionSetErrors {
     /// Name of the data set.
     pub name: String,
-    /// `test`, `held_out`, `seed` (the replay sample) or `since` (labels that came after the training set was fixed).
+    /// `test`, `held_out`, `replay` (the replay sample) or `since` (labels that came after the training set was fixed).
     pub kind: String,
     /// Number of structures.
     pub structures: u64,

@@ -85,7 +85,7 @@ impl LoadedCampaign {
             replay_weight: refit.replay_weight.get(),
             method: refit.method.clone(),
             held_out: refit.held_out,
-            max_seed_error_ratio: refit.max_seed_error_ratio.get(),
+            max_replay_error_ratio: refit.max_replay_error_ratio.get(),
             max_held_out_error_ratio: refit.max_held_out_error_ratio.get(),
             threads: refit.threads,
             start: refit.start,

@@ -141,7 +141,7 @@ pub fn held_out() -> f64 {
     0.1
 }
 
-pub fn max_seed_error_ratio() -> Positive {
+pub fn max_replay_error_ratio() -> Positive {
     positive(3.0)
 }
 

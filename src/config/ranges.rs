@@ -187,7 +187,7 @@ pub static RANGES: [Range; 131] = [
     range("refit.after_structures", "", [0.0, 1e9], [1.0, 1e5], ""),
     range("refit.after_time", TIME, [0.1, YEAR], [60.0, 30.0 * DAY], ""),
     range("refit.max_versions", "", [0.0, 1e4], [1.0, 100.0], ""),
-    range("refit.max_seed_error_ratio", "", [0.0, 1e6], [0.5, 20.0], ""),
+    range("refit.max_replay_error_ratio", "", [0.0, 1e6], [0.5, 20.0], ""),
     range("refit.max_held_out_error_ratio", "", [0.0, 1e6], [0.5, 5.0], ""),
     range("refit.max_attempts", "", [0.0, 1e9], [1.0, 20.0], ""),
     range("refit.threads", "", [0.0, 1024.0], [0.0, 512.0], ""),

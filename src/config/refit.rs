@@ -37,8 +37,8 @@ pub struct RefitSection {
     #[schemars(extend("minimum" = 0, "exclusiveMaximum" = 1))]
     pub held_out: f64,
     /// Largest mean absolute error of the forces on `replay`, relative to that of version 0. A version with more is refused.
-    #[serde(default = "defaults::max_seed_error_ratio")]
-    pub max_seed_error_ratio: Positive,
+    #[serde(default = "defaults::max_replay_error_ratio")]
+    pub max_replay_error_ratio: Positive,
     /// Largest mean absolute error of the forces on the held-out labels, relative to that of the parent. A version with more is
     /// refused.
     #[serde(default = "defaults::max_held_out_error_ratio")]

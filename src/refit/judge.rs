@@ -24,7 +24,7 @@ pub enum SetKind {
     /// Labels of seed structures that no version is trained on.
     HeldOut,
     /// The replay data.
-    Seed,
+    Replay,
     /// Labels that came after the training set was fixed.
     Since,
 }
@@ -107,7 +107,7 @@ impl DataSets {
         let mut sets = Vec::new();
         let mut add = |name: &str, kind, paths: &[PathBuf]| -> Result<(), RefitFailure> {
             let frames = match kind {
-                SetKind::Test | SetKind::Seed => read(paths)?,
+                SetKind::Test | SetKind::Replay => read(paths)?,
                 SetKind::HeldOut | SetKind::Since => read(paths).map_err(RefitFailure::of_input)?,
             };
             if !frames.is_empty() {
@@ -122,7 +122,7 @@ impl DataSets {
             add("held_out", SetKind::HeldOut, &[path])?;
         }
         let replay: Vec<_> = settings.replay.iter().map(|file| file.path.clone()).collect();
-        add("seed", SetKind::Seed, &replay)?;
+        add("replay", SetKind::Replay, &replay)?;
         if let Some(path) = since.path(directory, LabelFile::Since) {
             add("since", SetKind::Since, &[path])?;
         }
@@ -190,7 +190,7 @@ impl DataSets {
         EvaluationContext { threads, stop }: &EvaluationContext<'_>,
     ) -> Result<Option<Vec<SetErrors>>, UpfitError> {
         let is_stopped = || stop.is_cancelled();
-        let replay = self.sets.iter().filter(|set| set.kind == SetKind::Seed).map(|set| &set.frames[..]);
+        let replay = self.sets.iter().filter(|set| set.kind == SetKind::Replay).map(|set| &set.frames[..]);
         let trained_on: Vec<_> = replay.chain([&self.trained_on[..]]).collect();
         let zero = zero_of_labels(model, &trained_on, threads, &is_stopped)?;
         let Some(zero) = zero else { return Ok(None) };
@@ -239,15 +239,15 @@ pub fn load_version(config: &RefitterConfig, path: &Path) -> Result<GraceModel, 
 pub fn refusal(settings: &RefitSettings, sets: &[SetFigures]) -> Option<String> {
     // What it has forgotten before what it has not learned.
     let of_kind = |kind| sets.iter().filter(move |set| set.kind == kind);
-    of_kind(SetKind::Seed).chain(of_kind(SetKind::HeldOut)).find_map(|set| {
+    of_kind(SetKind::Replay).chain(of_kind(SetKind::HeldOut)).find_map(|set| {
         let version = set.version.force_mae;
         let rule = match set.kind {
-            SetKind::Seed => Some((
+            SetKind::Replay => Some((
                 "the replay data",
                 set.first.force_mae,
                 "version 0",
-                settings.max_seed_error_ratio,
-                "max_seed_error_ratio",
+                settings.max_replay_error_ratio,
+                "max_replay_error_ratio",
             )),
             SetKind::HeldOut => Some((
                 "the held-out labels",
@@ -300,7 +300,7 @@ mod tests {
             replay_weight: 1.0,
             method: RefitMethod::default(),
             held_out: 0.1,
-            max_seed_error_ratio: 3.0,
+            max_replay_error_ratio: 3.0,
             max_held_out_error_ratio: 1.0,
             threads: 1,
             start: RefitStart::default(),
@@ -314,13 +314,13 @@ mod tests {
     fn versions_are_refused_that_forget_or_do_not_improve() {
         let refused = |kind, errors| refusal(&settings(), &[set(kind, errors)]);
         assert_eq!(
-            refused(SetKind::Seed, [0.1, 0.9, 0.3]),
+            refused(SetKind::Replay, [0.1, 0.9, 0.3]),
             None,
             "a third of the limit is that of version 0"
         );
-        let forgot = refused(SetKind::Seed, [0.1, 0.9, 0.31]).unwrap();
+        let forgot = refused(SetKind::Replay, [0.1, 0.9, 0.31]).unwrap();
         let expected = "the force MAE on the replay data is 0.3100 eV/Å, 3.10 times that of version 0 (0.1000 eV/Å): expected at most 3 \
-                        times (refit.max_seed_error_ratio)";
+                        times (refit.max_replay_error_ratio)";
         assert_eq!(forgot, expected);
         assert_eq!(refused(SetKind::HeldOut, [0.1, 0.3, 0.3]), None);
         let worse = refused(SetKind::HeldOut, [0.9, 0.3, 0.31]).unwrap();

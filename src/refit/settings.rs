@@ -24,7 +24,7 @@ pub struct RefitterConfig {
     pub parent_version: u32,
     /// The model of that version.
     pub parent_model: HashedFile,
-    /// The model of version 0, whose errors on the replay data are the measure of `max_seed_error_ratio`.
+    /// The model of version 0, whose errors on the replay data are the measure of `max_replay_error_ratio`.
     pub first_model: HashedFile,
     /// The artifact of the parent, with its projection.
     pub parent_mixture: HashedFile,
@@ -50,8 +50,8 @@ pub struct RefitSettings {
     pub method: RefitMethod,
     /// Share of the seed structures whose labels are never trained on.
     pub held_out: f64,
-    /// See [`crate::config::RefitSection::max_seed_error_ratio`].
-    pub max_seed_error_ratio: f64,
+    /// See [`crate::config::RefitSection::max_replay_error_ratio`].
+    pub max_replay_error_ratio: f64,
     /// See [`crate::config::RefitSection::max_held_out_error_ratio`].
     pub max_held_out_error_ratio: f64,
     /// Number of threads; 0: all cores.

@@ -40,7 +40,7 @@ const DECIDING: &str = "force_mae";
 pub struct RecordedErrors<'a> {
     /// Name of the data set.
     pub set: &'a str,
-    /// `test`, `held_out`, `seed` or `since`.
+    /// `test`, `held_out`, `replay` or `since`.
     pub kind: &'a str,
     /// Number of its structures.
     pub structures: u64,

@@ -23,7 +23,7 @@ const TITLES: [&str; 10] = [
     ">core-hours",
     "date",
     ">held out (eV/Å)",
-    ">seed (eV/Å)",
+    ">replay (eV/Å)",
 ];
 
 /// Lists the versions.
@@ -40,7 +40,7 @@ pub fn run(location: &Location, json: bool) -> Result<ExitStatus, CommandError> 
 /// Mean absolute errors of the forces of a version, eV/Å: on labels held out, and on the replay data.
 fn force_errors(known: &KnownVersions, number: u32) -> [Option<f64>; 2] {
     let errors = errors_of(&known.versions, number);
-    ["held_out", "seed"]
+    ["held_out", "replay"]
         .map(|kind| errors.iter().find(|found| found.kind == kind).and_then(RecordedErrors::force_mae))
 }
 
@@ -83,9 +83,9 @@ fn to_json(known: &KnownVersions) -> Value {
     let mut versions = vec![first_to_json()];
     versions.extend(known.versions.iter().map(record_to_json));
     for (number, version) in (0..).zip(&mut versions) {
-        let [held_out, seed] = force_errors(known, number);
+        let [held_out, replay] = force_errors(known, number);
         version["in_force"] = json!(number == known.taken_up);
-        version["force_mae"] = json!({ "held_out": held_out, "seed": seed });
+        version["force_mae"] = json!({ "held_out": held_out, "replay": replay });
     }
     json!({ "in_force": known.taken_up, "not_taken_up": known.not_taken_up(), "versions": versions })
 }

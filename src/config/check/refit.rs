@@ -11,7 +11,7 @@ use crate::config::{
 };
 
 /// Names of the data sets that every version is judged by; no test set may have them.
-const OWN_SETS: [&str; 3] = ["held_out", "seed", "since"];
+const OWN_SETS: [&str; 3] = ["held_out", "replay", "since"];
 /// Name of the comparison with control frames.
 const CONTROL: &str = "control";
 
@@ -216,7 +216,7 @@ mod tests {
         let all = format!(
             "{REPLAY}\nreplay_weight = 0.02\nafter_structures = 50\nafter_time = \"24h\"\nmax_versions = 2\nheld_out = 0\n\
              start = \"first\"\ncontrol_frames = \"compare\"\ncomparisons = [{{ name = \"cold\", file = \"c.extxyz\" }}]\n\
-             max_seed_error_ratio = 2\nmax_held_out_error_ratio = 1.1\nmax_attempts = 2\nthreads = 2\n\
+             max_replay_error_ratio = 2\nmax_held_out_error_ratio = 1.1\nmax_attempts = 2\nthreads = 2\n\
              method = {{ native = {{ {native} }} }}\n{sets}"
         );
         let live = with(&all).replacen("# mode = \"reproducible\"", "mode = \"live\"", 1);
@@ -246,7 +246,7 @@ mod tests {
                 "refit.comparisons is a list of 1; expected refit.start = \"first\"",
             ),
             ("replay_weight = -1.0", "found -1, expected a finite number above 0"),
-            ("max_seed_error_ratio = 0", "found 0, expected a finite number above 0"),
+            ("max_replay_error_ratio = 0", "found 0, expected a finite number above 0"),
             ("threads = 5000", "refit.threads is 5000; expected at most 1024"),
         ]);
     }
@@ -299,7 +299,7 @@ mod tests {
 
     #[test]
     fn test_sets_have_names_of_their_own() {
-        for name in ["", "a b", "a/b", "é", "held_out", "seed", "since"] {
+        for name in ["", "a b", "a/b", "é", "held_out", "replay", "since"] {
             let line = format!("test_sets = [{{ name = \"{name}\", file = \"t\" }}]");
             let expected = format!("refit.test_sets.0.name is \"{name}\"; expected a name of letters");
             refused(&[(line.as_str(), expected.as_str())]);
