@@ -121,14 +121,18 @@ impl TextTable {
 
     /// Writes all rows.
     pub fn write(&self, out: &mut dyn Write) -> io::Result<()> {
-        for row in &self.rows {
+        self.lines().try_for_each(|line| writeln!(out, "{line}"))
+    }
+
+    /// All rows, without blanks at their ends.
+    pub fn lines(&self) -> impl Iterator<Item = String> {
+        self.rows.iter().map(|row| {
             let cells = row.iter().zip(&self.columns).map(|(cell, (width, number))| match number {
                 true => format!("{cell:>width$}"),
                 false => format!("{cell:<width$}"),
             });
-            writeln!(out, "{}", cells.collect::<Vec<_>>().join("  ").trim_end())?;
-        }
-        Ok(())
+            cells.collect::<Vec<_>>().join("  ").trim_end().to_owned()
+        })
     }
 }
 

@@ -4,13 +4,15 @@ use std::fmt;
 
 use calm::forgetting::GradeDistribution;
 use monitor::end_reason::CampaignEnd;
-use monitor::label_statistics::{self, ErrorsByGrade, LabelStatistics};
+use monitor::label_statistics::comparison::{ComparedGroup, WalkComparison};
+use monitor::label_statistics::{self, ErrorsByGrade, LARGE_FORCE_ERROR, LabelStatistics};
 use monitor::versions::{CampaignVersions, newest_with_labels};
 use monitor::walk_ends::WalkEnds;
 use store::{CampaignStatus, Store, StoreError, Unlabelled};
 use wire::ContentHash;
 
-use crate::output::{count, decimals};
+use crate::output::{TextTable, count, decimals};
+use crate::wording::comparison::{estimate, intervals};
 use crate::wording::{budget, end_reason, energies, unlabelled, versions, walk_ends};
 
 /// Largest number of seed structures with failed labels to show.
@@ -23,6 +25,7 @@ pub struct Summary {
     /// Why it ended.
     end: Option<CampaignEnd>,
     statistics: LabelStatistics,
+    comparison: WalkComparison,
     /// Structures whose labels failed for good.
     unlabelled: Vec<Unlabelled>,
     /// Grades of the training frames under the newest mixture, if they are monitored.
@@ -36,13 +39,14 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<Summary, Store
     let status = store.status().await?;
     let end = CampaignEnd::read(store, &status).await?;
     let statistics = label_statistics::read(store, protocol, None).await?;
+    let comparison = statistics.comparison();
     let version = newest_with_labels(store, protocol, &store.walk_versions().await?).await?;
     let unlabelled = store.unlabelled(protocol, version, true).await?;
     let values = store.values().await?;
     let watched = values.iter().find(|(name, _)| name == "training_frames");
     let watched: Option<GradeDistribution> = watched.and_then(|(_, text)| serde_json::from_str(text).ok());
     let versions = CampaignVersions::read(store, &status, &values).await?;
-    Ok(Summary { status, end, statistics, unlabelled, training: watched, versions })
+    Ok(Summary { status, end, statistics, comparison, unlabelled, training: watched, versions })
 }
 
 impl fmt::Display for Summary {
@@ -154,12 +158,22 @@ impl Summary {
             None => "the potential".to_owned(),
         };
         writeln!(f, "force error of {version} against the grade of the original mixture:")?;
-        writeln!(
-            f,
-            "           atoms   mean error   γ > 1   γ_nbr > 1   ρ(γ, error)   ρ(γ_nbr, error)   ROC-AUC(γ)   ROC-AUC(γ_nbr)"
-        )?;
-        writeln!(f, "  biased   {}", line(&self.statistics.biased))?;
-        writeln!(f, "  control  {}", line(&self.statistics.control))?;
+        let mut table = TextTable::new(&[
+            "",
+            ">atoms",
+            ">mean error (eV/Å)",
+            ">γ > 1",
+            ">γ_nbr > 1",
+            ">ρ(γ, error)",
+            ">ρ(γ_nbr, error)",
+            ">ROC-AUC(γ)",
+            ">ROC-AUC(γ_nbr)",
+        ]);
+        let WalkComparison { pooled, .. } = &self.comparison;
+        table.push(line("biased", &self.statistics.biased, &pooled.biased));
+        table.push(line("control", &self.statistics.control, &pooled.control));
+        table.lines().try_for_each(|line| writeln!(f, "  {line}"))?;
+        writeln!(f, "  {}", intervals(&pooled.all.units, &self.comparison))?;
         let energy = self.statistics.energies.summary();
         if let Some(line) = energies::errors(&energy) {
             writeln!(f, "energy error of the potential: {line}")?;
@@ -189,21 +203,22 @@ fn shared_note(statistics: &LabelStatistics) -> String {
 }
 
 /// A line of the comparison.
-fn line(grades: &ErrorsByGrade) -> String {
+fn line(origin: &str, grades: &ErrorsByGrade, group: &ComparedGroup) -> Vec<String> {
     let ErrorsByGrade { gamma, gamma_nbr, .. } = grades;
     if gamma.atoms() == 0 {
-        return "no labelled structures".to_owned();
+        return vec![origin.to_owned(), "none".to_owned()];
     }
-    let percent = |share: Option<f64>| decimals(share.map(|share| 100.0 * share), 0);
-    format!(
-        "{:>5}   {} eV/Å   {:>4} %      {:>4} %   {:>11}   {:>15}   {:>10}   {:>14}",
-        gamma.atoms(),
+    let percent =
+        |share: Option<f64>| share.map_or("–".to_owned(), |share| format!("{:.0} %", 100.0 * share));
+    let mut cells = vec![
+        origin.to_owned(),
+        gamma.atoms().to_string(),
         decimals(gamma.mean(), 3),
         percent(gamma.fraction_above(1.0)),
         percent(gamma_nbr.fraction_above(1.0)),
-        decimals(gamma.spearman(), 2),
-        decimals(gamma_nbr.spearman(), 2),
-        decimals(gamma.roc_auc(), 2),
-        decimals(gamma_nbr.roc_auc(), 2),
-    )
+    ];
+    let areas = [&group.gamma, &group.gamma_nbr].map(|grade| grade.area_above(LARGE_FORCE_ERROR));
+    let estimates = [group.gamma.spearman, group.gamma_nbr.spearman].into_iter().chain(areas);
+    cells.extend(estimates.map(|found| estimate(&found, 1.0, 2)));
+    cells
 }
