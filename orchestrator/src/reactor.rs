@@ -100,7 +100,7 @@ struct ReactorState {
     /// Decisions that are not being written yet.
     decided: Option<Commit>,
     /// Idle walkers, in order of arrival.
-    waiting: VecDeque<(u32, Reply)>,
+    waiting: VecDeque<(u32, WorkReply)>,
     /// Replies that wait for the commit before them.
     pending_replies: Vec<PendingReply>,
     /// Number of walkers that crashed with the current assignment of a walk.
@@ -111,12 +111,12 @@ struct ReactorState {
     paused_polled_at: Option<Instant>,
 }
 
-type Reply = oneshot::Sender<Option<WorkItem>>;
+type WorkReply = oneshot::Sender<Option<WorkItem>>;
 
 /// A reply to a walker.
 struct PendingReply {
     walker: u32,
-    reply: Reply,
+    reply: WorkReply,
     work: Option<WorkItem>,
 }
 

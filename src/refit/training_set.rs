@@ -98,12 +98,12 @@ pub enum LabelChoice<'a> {
 }
 
 /// Where each label belongs.
-enum Sorter {
+enum LabelSorter {
     OfSet { split: LabelSplit, last_decision: i64 },
     Since(HashSet<ExportCursor>),
 }
 
-impl Sorter {
+impl LabelSorter {
     fn new(choice: &LabelChoice<'_>, split: LabelSplit, last_decision: i64) -> Self {
         match choice {
             LabelChoice::OfSet => Self::OfSet { split, last_decision },
@@ -153,7 +153,7 @@ pub async fn write(
     let mut found = LabelFiles::default();
     let Some(protocol) = store.protocol_in_force().await? else { return Ok(Some(found)) };
     let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: true };
-    let sorter = Sorter::new(&choice, split, set.last_decision);
+    let sorter = LabelSorter::new(&choice, split, set.last_decision);
     let mut label_set = LabelSet::new(protocol.hash);
     let (campaign, conditions) = (store.campaign().await?.id.to_string(), store.walk_conditions().await?);
     let mut files = BTreeMap::new();

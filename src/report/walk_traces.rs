@@ -94,7 +94,7 @@ pub async fn read(
 impl GroupTraces {
     async fn read(store: &Store, group: &str, walks: &[&WalkStatus]) -> Result<Option<Self>, StoreError> {
         let last = walks.iter().map(|walk| walk.step).max().unwrap_or(0);
-        let (mut lines, mut pieces) = (Vec::new(), Pieces::new(last));
+        let (mut lines, mut pieces) = (Vec::new(), PieceMeans::new(last));
         let (mut number, mut time_steps) = (0, Vec::new());
         for walk in walks {
             let points = store.walk_trace(WalkId(walk.walk)).await?;
@@ -124,12 +124,12 @@ impl GroupTraces {
 }
 
 /// The means of the walks by piece and quantity.
-struct Pieces {
+struct PieceMeans {
     length: f64,
     means: Vec<[Vec<f64>; QUANTITIES.len()]>,
 }
 
-impl Pieces {
+impl PieceMeans {
     fn new(last: u64) -> Self {
         Self {
             length: (last + 1) as f64 / PIECES as f64,

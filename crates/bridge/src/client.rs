@@ -13,7 +13,7 @@ use crate::error::CallError;
 use crate::recipient::read_answer;
 
 /// How a model reaches its device.
-pub(crate) enum Connection {
+pub(crate) enum DeviceConnection {
     /// In this process. Clients are dealt evenly over the devices.
     Local(Vec<Arc<Device>>),
     /// Through shared memory.
@@ -37,21 +37,21 @@ pub(crate) enum Client {
 /// Clients that potentials of a model have used, for the next ones: a walk makes a potential for each assignment, and a client costs both
 /// ends memory.
 pub(crate) struct ClientPool {
-    connection: Connection,
+    connection: DeviceConnection,
     idle: Mutex<Vec<Client>>,
 }
 
 impl ClientPool {
     /// An empty pool.
-    pub fn new(connection: Connection) -> Self {
+    pub fn new(connection: DeviceConnection) -> Self {
         Self { connection, idle: Mutex::default() }
     }
 
     /// The devices of this process.
     pub fn devices(&self) -> &[Arc<Device>] {
         match &self.connection {
-            Connection::Local(devices) => devices,
-            Connection::Shared(..) => &[],
+            DeviceConnection::Local(devices) => devices,
+            DeviceConnection::Shared(..) => &[],
         }
     }
 
@@ -71,15 +71,15 @@ impl ClientPool {
 }
 
 impl Client {
-    fn connect(connection: &Connection) -> Result<Self, PotentialError> {
+    fn connect(connection: &DeviceConnection) -> Result<Self, PotentialError> {
         static NEXT: AtomicU64 = AtomicU64::new(1);
         match connection {
-            Connection::Local(devices) => {
+            DeviceConnection::Local(devices) => {
                 let number = NEXT.fetch_add(1, Ordering::Relaxed);
                 let device = Arc::clone(&devices[number as usize % devices.len()]);
                 Ok(Self::Local { device, number })
             }
-            Connection::Shared(address, stopping) => {
+            DeviceConnection::Shared(address, stopping) => {
                 let calls = CallClient::connect(address, stopping.clone());
                 let calls = calls.map_err(|error| PotentialError::Unavailable(error.to_string()))?;
                 Ok(Self::Shared { calls: Box::new(calls), known: None })

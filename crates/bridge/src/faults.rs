@@ -38,7 +38,7 @@ impl ServerFault {
 
 /// An answer of the server.
 #[derive(Clone, Debug, Deserialize)]
-pub(crate) struct Reply {
+pub(crate) struct ServerReply {
     pub status: String,
     #[serde(default)]
     pub id: Option<u64>,
@@ -54,7 +54,7 @@ pub(crate) struct Reply {
     pub seconds: f64,
 }
 
-impl Reply {
+impl ServerReply {
     /// Reads a line that answers the call `id`.
     ///
     /// # Errors

@@ -10,7 +10,7 @@ use tokio_util::sync::CancellationToken;
 use wire::ipc::CallAddress;
 
 use crate::call::{BondGeometry, Topology};
-use crate::client::{Client, ClientPool, Connection};
+use crate::client::{Client, ClientPool, DeviceConnection};
 use crate::description::{AdapterFeatures, ModelDescription, RawFeatures};
 use crate::device::Device;
 use crate::feature_map::{MappedFeatures, RawProjection};
@@ -37,7 +37,7 @@ impl PythonModel {
     pub fn local(devices: Vec<Arc<Device>>) -> Result<Self, String> {
         let first = devices.first().ok_or("a model without a device")?;
         let description = first.info().description().clone();
-        Self::new(description, Connection::Local(devices))
+        Self::new(description, DeviceConnection::Local(devices))
     }
 
     /// The model of a device of another process. Cancelling `stopping` ends calls that do not end.
@@ -49,10 +49,10 @@ impl PythonModel {
         address: CallAddress,
         stopping: CancellationToken,
     ) -> Result<Self, String> {
-        Self::new(description, Connection::Shared(address, stopping))
+        Self::new(description, DeviceConnection::Shared(address, stopping))
     }
 
-    fn new(description: ModelDescription, connection: Connection) -> Result<Self, String> {
+    fn new(description: ModelDescription, connection: DeviceConnection) -> Result<Self, String> {
         let elements = description.check()?;
         let clients = Arc::new(ClientPool::new(connection));
         Ok(Self { description, elements, projection: None, clients })

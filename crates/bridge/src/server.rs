@@ -11,7 +11,7 @@ use crate::batch::{BatchArena, BatchKind};
 use crate::call::BondGeometry;
 use crate::description::{AdapterFeatures, ModelDescription, PROTOCOL};
 use crate::events::DeviceEvent;
-use crate::faults::{Reply, ServerFault};
+use crate::faults::{ServerFault, ServerReply};
 use crate::process::{ServerEvent, ServerProcess};
 use crate::self_test::{Evaluate, TestResult};
 use crate::settings::PythonSettings;
@@ -82,7 +82,7 @@ impl Server {
             .map_err(|error| ServerFault::Exited(format!("{}: {error}", settings.names())))
             .and_then(|()| wait.line(deadline, "hello"));
         let description = line.and_then(|line| {
-            Reply::read(&line, None, &settings.names())?;
+            ServerReply::read(&line, None, &settings.names())?;
             let nonsense =
                 |error: String| ServerFault::Reported(format!("{}, hello: {error}", settings.names()));
             let description: ModelDescription =
@@ -177,7 +177,7 @@ impl Server {
         call: &Outstanding,
         names: &str,
     ) -> Result<(bool, f64), ServerFault> {
-        let reply = Reply::read(line, Some(call.id), names)?;
+        let reply = ServerReply::read(line, Some(call.id), names)?;
         let evaluates = matches!(call.kind, BatchKind::Evaluate { .. });
         self.arenas[call.slot].unlink();
         let is_new = self.known_shapes.insert((self.program_shape(call.slot), evaluates));

@@ -19,10 +19,11 @@ pub struct InstalledCode {
 }
 
 /// How a program tells its version.
-type Query = fn(&[String], &BTreeMap<String, String>, &PassedEnvironment) -> Result<String, SetupError>;
+type VersionQuery =
+    fn(&[String], &BTreeMap<String, String>, &PassedEnvironment) -> Result<String, SetupError>;
 
 /// Method, usual name and query of each program.
-const CODES: [(&str, &str, Option<Query>); 5] = [
+const CODES: [(&str, &str, Option<VersionQuery>); 5] = [
     ("abinit", "abinit", Some(abinit::version)),
     ("cp2k", "cp2k", Some(cp2k::version)),
     ("espresso", "pw.x", Some(espresso::version)),
@@ -35,9 +36,9 @@ pub fn installed_codes() -> Vec<InstalledCode> {
     CODES.iter().map(|(method, program, query)| look_for(method, program, *query)).collect()
 }
 
-fn look_for(method: &'static str, program: &'static str, query: Option<Query>) -> InstalledCode {
+fn look_for(method: &'static str, program: &'static str, query: Option<VersionQuery>) -> InstalledCode {
     let path = executable::find(program).ok();
-    let ask = |query: Query| {
+    let ask = |query: VersionQuery| {
         let environment = version_query::environment(&BTreeMap::new());
         query(&[program.to_owned()], &environment, &PassedEnvironment::default())
     };
@@ -74,7 +75,7 @@ mod tests {
     /// `echo` is on every path, and is none of these programs.
     #[test]
     fn another_program_of_that_name_is_an_error() {
-        for (query, text) in [(abinit::version as Query, "ABINIT"), (gpaw_version, "GPAW")] {
+        for (query, text) in [(abinit::version as VersionQuery, "ABINIT"), (gpaw_version, "GPAW")] {
             let found = query(&["echo".to_owned()], &BTreeMap::new(), &PassedEnvironment::default());
             let message = found.unwrap_err().to_string();
             assert!(message.contains(text), "{message}");

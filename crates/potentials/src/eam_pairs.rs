@@ -18,12 +18,12 @@ pub(crate) struct Functions {
     /// Number of intervals per pair of elements.
     intervals: usize,
     /// `[(host * elements + source) * intervals + interval]`, followed by one that is zero.
-    pieces: Vec<Piece>,
+    pieces: Vec<TableInterval>,
 }
 
 /// The coefficients of r φ(r), eV Å, and of the density ρ(r) of the source on the host within one interval,
 /// stored together because they are used together.
-type Piece = [[f64; 2]; 4];
+type TableInterval = [[f64; 2]; 4];
 
 impl Functions {
     pub fn new(tables: &Setfl, style: EamStyle) -> Self {
@@ -125,7 +125,8 @@ impl AddPairs<'_> {
             let mut here = [NONE; 2];
             for (near, atoms) in near.chunks(LANES).zip(atoms.chunks(LANES)) {
                 let (atoms, d, squared) = columns(i, near, atoms);
-                let pieces = Pieces::new::<ONE>(self.functions, self.kinds, i, &atoms, near.len(), &squared);
+                let pieces =
+                    PairIntervals::new::<ONE>(self.functions, self.kinds, i, &atoms, near.len(), &squared);
                 let (block, energies, densities) = add_block::<ONE>(self.functions, &pieces, atoms, d);
                 for b in 0..LANES {
                     here[0][b] += energies[b];
@@ -156,7 +157,7 @@ fn columns(i: usize, near: &[[f64; 4]], atoms: &[u32]) -> ([u32; LANES], [Lanes;
 }
 
 /// Table lookups for eight pairs.
-struct Pieces {
+struct PairIntervals {
     /// Of the neighbour on this atom.
     here: [usize; LANES],
     /// Of this atom on the neighbour.
@@ -166,7 +167,7 @@ struct Pieces {
     per_r: Lanes,
 }
 
-impl Pieces {
+impl PairIntervals {
     /// The lookups of `count` pairs; unused lanes point to the zero piece.
     #[inline(always)]
     fn new<const ONE: bool>(
@@ -205,7 +206,7 @@ impl Pieces {
 #[inline(always)]
 fn add_block<const ONE: bool>(
     functions: &Functions,
-    Pieces { here, there, p, per_r }: &Pieces,
+    PairIntervals { here, there, p, per_r }: &PairIntervals,
     atoms: [u32; LANES],
     d: [Lanes; 3],
 ) -> (PairBlock, Lanes, [Lanes; 2]) {

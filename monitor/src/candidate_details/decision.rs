@@ -35,14 +35,14 @@ pub struct DecisionDetails {
     /// Version of the mixture afterwards.
     pub mixture_version: u64,
     /// The update that made the mixture cover the candidate.
-    pub update: Option<Update>,
+    pub update: Option<UpdateDetails>,
     /// Relations to other candidates by coverage.
     pub coverage: Coverage,
 }
 
 /// An update of the mixture.
 #[derive(Clone, Debug, Serialize)]
-pub struct Update {
+pub struct UpdateDetails {
     /// The configured rule that chooses α.
     pub rule: Option<UpdateRule>,
     /// Convex or additive.
@@ -96,7 +96,7 @@ impl DecisionDetails {
         rules: &Value,
     ) -> Result<Self, StoreError> {
         let detail = &logged.detail;
-        let update = Update::parse(detail, rules, &elements(store).await?)?;
+        let update = UpdateDetails::parse(detail, rules, &elements(store).await?)?;
         let mut coverage = Coverage::default();
         let reason = detail["reason"].as_str().map(str::to_owned);
         if reason.as_deref() == Some("covered") {
@@ -123,7 +123,7 @@ impl DecisionDetails {
     }
 }
 
-impl Update {
+impl UpdateDetails {
     fn parse(detail: &Value, rules: &Value, elements: &[String]) -> Result<Option<Self>, StoreError> {
         let damaged = |error| StoreError::damaged("the decision log", error);
         let Some(found) = detail.get("update") else { return Ok(None) };

@@ -17,7 +17,7 @@ use serde_json::Value;
 use store::{CandidateRef, CoveredCandidate, Store, StoreError, StoredCandidate};
 use wire::ContentHash;
 
-pub use decision::{Coverage, DecisionDetails, ELEMENTS_KEY, Update};
+pub use decision::{Coverage, DecisionDetails, ELEMENTS_KEY, UpdateDetails};
 pub use grades::{CandidateGrades, GradedAtom, Trigger};
 pub use labels::{CandidateLabel, ForceError, LabelJob};
 pub use walk::{Discovery, GuardDistances, GuardPairDistance};

@@ -19,7 +19,7 @@ use super::report::{ErrorHistograms, MeanErrors, TrainingErrors};
 pub const BOOTSTRAP: Bootstrap = Bootstrap { draws: 1000, level: 0.95, seed: 1 };
 
 /// One value of each statistic, `None` where it is not defined.
-type Values = Vec<Option<f64>>;
+type StatisticValues = Vec<Option<f64>>;
 
 /// A structure with the absolute error of its energy per atom without the offsets of elements, eV; `None` where that is not known.
 type StructureEnergyError<'a> = (&'a SampledStructure, Option<f64>);

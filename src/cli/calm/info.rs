@@ -32,7 +32,7 @@ pub struct CalmInfoArgs {
 /// The contents of a file.
 #[derive(Debug, Serialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
-enum Content {
+enum FileContent {
     Model(Box<Model>),
     Artifact(MixtureInfo),
 }
@@ -120,12 +120,12 @@ impl CalmInfoArgs {
     }
 }
 
-fn inspect(path: &Path) -> Result<Content, CommandError> {
+fn inspect(path: &Path) -> Result<FileContent, CommandError> {
     let archive = &NpzFile::open(path)
         .map_err(|error| CommandError::Input(format!("{error} (kokkos.npz or gmm_artifacts.npz)")))?;
     if archive.contains("__schema_version__") {
         let artifact = Artifact::load(path).map_err(CommandError::input)?;
-        return Ok(Content::Artifact(MixtureInfo::new(&artifact, "__schema_version__", archive)));
+        return Ok(FileContent::Artifact(MixtureInfo::new(&artifact, "__schema_version__", archive)));
     }
     if !archive.contains("element_names") {
         return Err(CommandError::Input(format!(
@@ -144,7 +144,7 @@ fn inspect(path: &Path) -> Result<Content, CommandError> {
     let note =
         archive.contains(NOTE).then(|| archive.strings(NOTE)).transpose().map_err(CommandError::input)?;
     let training = note.and_then(|texts| serde_json::from_str(texts.first()?).ok());
-    Ok(Content::Model(Box::new(Model { training, ..Model::new(&model, mixture) })))
+    Ok(FileContent::Model(Box::new(Model { training, ..Model::new(&model, mixture) })))
 }
 
 impl Model {
@@ -327,7 +327,7 @@ fn components(symbols: &[String], mixture: &Mixture, archive: &NpzFile) -> Vec<C
     mixture.iter().map(component).collect()
 }
 
-impl Content {
+impl FileContent {
     fn write(&self, path: &Path, out: &mut dyn Write) -> io::Result<()> {
         let what = match self {
             Self::Model(_) => "a GRACE model",

@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use calm::UpdateEnd;
-use monitor::candidate_details::{Coverage, DecisionDetails, Update};
+use monitor::candidate_details::{Coverage, DecisionDetails, UpdateDetails};
 
 use super::grades::block;
 use super::{SHOWN, line, shortened_list};
@@ -53,7 +53,7 @@ fn describe(reason: &str) -> &'static str {
     }
 }
 
-fn write_update(out: &mut dyn Write, update: &Update, atoms: usize) -> io::Result<()> {
+fn write_update(out: &mut dyn Write, update: &UpdateDetails, atoms: usize) -> io::Result<()> {
     let found = &update.found;
     let kind = update.covariance_update.as_deref().unwrap_or_default();
     let (rule, counted) = match update.rule {

@@ -16,11 +16,11 @@ const LISTED: usize = 20;
 pub struct WalkDraw {
     per_walk: usize,
     random_seed: u64,
-    walks: BTreeMap<WalkId, Walk>,
+    walks: BTreeMap<WalkId, DrawnOfWalk>,
 }
 
 #[derive(Default)]
-struct Walk {
+struct DrawnOfWalk {
     /// The smallest keys.
     drawn: BTreeSet<([u8; 32], ExportCursor)>,
     all: usize,
@@ -53,7 +53,7 @@ impl WalkDraw {
 
     /// The structures with the smallest keys of each walk.
     pub fn finish(self) -> Drawn {
-        let number = |(id, walk): (&WalkId, &Walk)| (*id, walk.drawn.len(), walk.all);
+        let number = |(id, walk): (&WalkId, &DrawnOfWalk)| (*id, walk.drawn.len(), walk.all);
         let numbers = self.walks.iter().map(number).collect();
         let cursors = self.walks.into_values().flat_map(|walk| walk.drawn).map(|(_, cursor)| cursor);
         Drawn { cursors: cursors.collect(), numbers }

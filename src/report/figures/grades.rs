@@ -11,7 +11,7 @@ use super::errors::{MIN_ATOMS, middle, ribbons};
 use super::{NO_LABELS, row};
 
 /// A quantity of an atom.
-type AtomQuantity = fn(&CollectedAtom) -> f64;
+type CollectedQuantity = fn(&CollectedAtom) -> f64;
 
 /// Number of bins of a panel.
 const BINS: usize = 18;
@@ -27,7 +27,7 @@ pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
     let mut figure = Figure::new("grades", description, WIDTH, 226.0);
     let mut numbers =
         Csv::new(&["panel", "low", "high", "atoms", "p5", "p10", "p25", "median", "p75", "p90", "p95"]);
-    let panels: [(char, &str, AtomQuantity); 2] =
+    let panels: [(char, &str, CollectedQuantity); 2] =
         [('a', "γ", |atom| atom.gamma), ('b', "γ_{nbr}", |atom| atom.gamma_nbr)];
     let mut correlations = Vec::new();
     for ((letter, title, of), place) in panels.into_iter().zip(row(2, [46.0, 56.0, 12.0], 28.0, 162.0)) {

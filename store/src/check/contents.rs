@@ -74,7 +74,7 @@ from_columns!(LabelContent { atoms, energy, forces, stress, details });
 from_columns!(TextContent { text });
 
 /// A row whose content can be checked.
-trait Content: FromRow {
+trait CheckedContent: FromRow {
     /// What is wrong with it.
     fn fault(&self) -> Option<String>;
 }
@@ -83,7 +83,7 @@ trait Content: FromRow {
 type Checked = (&'static CheckedTable, &'static [&'static CheckedColumn]);
 
 /// The fault of a row: invalid content or a wrong checksum.
-fn fault<C: Content>(row: &SqlRow, (table, columns): Checked) -> Option<String> {
+fn fault<C: CheckedContent>(row: &SqlRow, (table, columns): Checked) -> Option<String> {
     let content = match C::from_row(row) {
         Ok(content) => content.fault(),
         Err(error) => Some(error.to_string()),
@@ -128,7 +128,7 @@ impl<'a> Contents<'a> {
         Ok(contents.findings)
     }
 
-    async fn table<C: Content>(&mut self, checked: Checked, sql: &'static str) -> Result<()> {
+    async fn table<C: CheckedContent>(&mut self, checked: Checked, sql: &'static str) -> Result<()> {
         let (mut after, mut faults, what) = (0, Vec::new(), checked.0.name);
         loop {
             let page = query(sql).bind(after).bind(PAGE).rows(&mut *self.transaction).await?;
@@ -186,13 +186,13 @@ impl<'a> Contents<'a> {
     }
 }
 
-impl Content for StructureContent {
+impl CheckedContent for StructureContent {
     fn fault(&self) -> Option<String> {
         decode_structure(&self.data, &self.hash).err().map(|_| "it does not match its hash".to_owned())
     }
 }
 
-impl Content for CandidateContent {
+impl CheckedContent for CandidateContent {
     fn fault(&self) -> Option<String> {
         let block = match CandidateBlock::from_bytes(&self.block) {
             Ok(block) => block,
@@ -221,7 +221,7 @@ impl Content for CandidateContent {
     }
 }
 
-impl Content for LabelContent {
+impl CheckedContent for LabelContent {
     fn fault(&self) -> Option<String> {
         let label =
             match decode_label(self.energy, &self.forces, self.stress.as_deref(), self.details.as_deref()) {
@@ -241,7 +241,7 @@ impl Content for LabelContent {
     }
 }
 
-impl Content for TextContent {
+impl CheckedContent for TextContent {
     fn fault(&self) -> Option<String> {
         let parsed: serde_json::Result<serde_json::Value> = serde_json::from_str(&self.text);
         parsed.err().map(|error| format!("its text is not valid JSON ({error})"))

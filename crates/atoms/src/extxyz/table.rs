@@ -22,10 +22,10 @@ pub(super) struct AtomTable {
 struct TableColumn {
     name: String,
     width: usize,
-    content: Content,
+    content: ColumnContent,
 }
 
-enum Content {
+enum ColumnContent {
     Symbol,
     AtomicNumber,
     Position,
@@ -58,9 +58,10 @@ impl AtomTable {
             table.columns.push(TableColumn { name: (*name).to_owned(), width, content });
         }
         let positions =
-            table.columns.iter().filter(|column| matches!(column.content, Content::Position)).count();
-        let elements =
-            |column: &&TableColumn| matches!(column.content, Content::Symbol | Content::AtomicNumber);
+            table.columns.iter().filter(|column| matches!(column.content, ColumnContent::Position)).count();
+        let elements = |column: &&TableColumn| {
+            matches!(column.content, ColumnContent::Symbol | ColumnContent::AtomicNumber)
+        };
         if positions != 1 || table.columns.iter().filter(elements).count() != 1 {
             return Err(fault("one column pos:R:3 and one of species:S:1 and Z:I:1"));
         }
@@ -78,12 +79,14 @@ impl AtomTable {
             let name = &column.name;
             let mut take = fields.by_ref().take(column.width);
             match &mut column.content {
-                Content::Ignored => take.for_each(drop),
-                Content::Symbol => self.species.extend(take.map(symbol).collect::<Result<Vec<_>, _>>()?),
-                Content::AtomicNumber => {
+                ColumnContent::Ignored => take.for_each(drop),
+                ColumnContent::Symbol => {
+                    self.species.extend(take.map(symbol).collect::<Result<Vec<_>, _>>()?)
+                }
+                ColumnContent::AtomicNumber => {
                     self.species.extend(take.map(atomic_number).collect::<Result<Vec<_>, _>>()?);
                 }
-                Content::Position => {
+                ColumnContent::Position => {
                     let mut position = [0.0; 3];
                     for (x, (index, field)) in position.iter_mut().zip(take) {
                         let finite = field.parse().ok().filter(|x: &f64| x.is_finite());
@@ -91,7 +94,7 @@ impl AtomTable {
                     }
                     self.positions.push(position);
                 }
-                Content::Array(array) => take.try_for_each(|(index, field)| {
+                ColumnContent::Array(array) => take.try_for_each(|(index, field)| {
                     array.entries.push(field).map_err(|expected| field_fault(index, name, field, expected))
                 })?,
             }
@@ -102,7 +105,7 @@ impl AtomTable {
     /// Species, positions, and the other columns by name.
     pub(super) fn finish(self) -> (Vec<Species>, Vec<Vec3>, BTreeMap<String, Column>) {
         let arrays = self.columns.into_iter().filter_map(|column| match column.content {
-            Content::Array(array) => Some((column.name, array)),
+            ColumnContent::Array(array) => Some((column.name, array)),
             _ => None,
         });
         (self.species, self.positions, arrays.collect())
@@ -110,20 +113,20 @@ impl AtomTable {
 }
 
 /// The use of a column; on failure, what was expected.
-fn content(name: &str, kind: &str, width: usize, numbered: bool) -> Result<Content, &'static str> {
+fn content(name: &str, kind: &str, width: usize, numbered: bool) -> Result<ColumnContent, &'static str> {
     match (name, kind, width) {
-        ("species" | "symbols", "S", 1) if numbered => Ok(Content::Ignored),
-        ("species" | "symbols", "S", 1) => Ok(Content::Symbol),
+        ("species" | "symbols", "S", 1) if numbered => Ok(ColumnContent::Ignored),
+        ("species" | "symbols", "S", 1) => Ok(ColumnContent::Symbol),
         ("species" | "symbols", ..) => Err("species:S:1"),
-        ("Z" | "numbers", "I", 1) => Ok(Content::AtomicNumber),
+        ("Z" | "numbers", "I", 1) => Ok(ColumnContent::AtomicNumber),
         ("Z" | "numbers", ..) => Err("Z:I:1"),
-        ("pos" | "positions", "R", 3) => Ok(Content::Position),
+        ("pos" | "positions", "R", 3) => Ok(ColumnContent::Position),
         ("pos" | "positions", ..) => Err("pos:R:3"),
         ("", ..) => Err("a name for each column"),
-        (_, "R", _) => Ok(Content::Array(Column { width, entries: ColumnData::Real(vec![]) })),
-        (_, "I", _) => Ok(Content::Array(Column { width, entries: ColumnData::Int(vec![]) })),
-        (_, "L", _) => Ok(Content::Array(Column { width, entries: ColumnData::Bool(vec![]) })),
-        (_, "S", _) => Ok(Content::Array(Column { width, entries: ColumnData::Text(vec![]) })),
+        (_, "R", _) => Ok(ColumnContent::Array(Column { width, entries: ColumnData::Real(vec![]) })),
+        (_, "I", _) => Ok(ColumnContent::Array(Column { width, entries: ColumnData::Int(vec![]) })),
+        (_, "L", _) => Ok(ColumnContent::Array(Column { width, entries: ColumnData::Bool(vec![]) })),
+        (_, "S", _) => Ok(ColumnContent::Array(Column { width, entries: ColumnData::Text(vec![]) })),
         _ => Err("one of the types R, I, S and L"),
     }
 }

@@ -6,7 +6,7 @@
 use crate::quoted::{is_plain, quoted};
 
 /// Placeholders with their values; `None` for a value that this job does not have.
-pub(super) type Values<'a> = [(&'a str, Option<String>)];
+pub(super) type PlaceholderValues<'a> = [(&'a str, Option<String>)];
 
 /// How a value is inserted: line, name and value give the text, or what is wrong.
 pub(super) type Insert<'a> = &'a dyn Fn(&str, &str, &str) -> Result<String, String>;
@@ -22,7 +22,7 @@ pub struct TemplateFault {
 
 /// A part of a line.
 #[derive(Debug, PartialEq)]
-enum Piece<'a> {
+enum LinePart<'a> {
     Text(&'a str),
     Value(&'a str),
     If(&'a str),
@@ -49,7 +49,11 @@ impl TemplateFault {
 /// # Errors
 /// Unknown placeholders, placeholders of values that the job does not have, conditions without end, and values that cannot stand
 /// where they are.
-pub(super) fn fill(template: &str, values: &Values<'_>, insert: Insert<'_>) -> Result<String, TemplateFault> {
+pub(super) fn fill(
+    template: &str,
+    values: &PlaceholderValues<'_>,
+    insert: Insert<'_>,
+) -> Result<String, TemplateFault> {
     let mut text = String::with_capacity(template.len());
     for (number, line) in template.split_inclusive('\n').enumerate() {
         let filled = fill_line(line, values, insert);
@@ -60,7 +64,11 @@ pub(super) fn fill(template: &str, values: &Values<'_>, insert: Insert<'_>) -> R
 }
 
 /// A filled line, or nothing if it is left out.
-fn fill_line(line: &str, values: &Values<'_>, insert: Insert<'_>) -> Result<Option<String>, String> {
+fn fill_line(
+    line: &str,
+    values: &PlaceholderValues<'_>,
+    insert: Insert<'_>,
+) -> Result<Option<String>, String> {
     let find = |name: &str| {
         let known = values.iter().find(|(known, _)| *known == name).map(|(_, value)| value.as_deref());
         known.ok_or_else(|| {
@@ -72,9 +80,9 @@ fn fill_line(line: &str, values: &Values<'_>, insert: Insert<'_>) -> Result<Opti
     for piece in pieces(line) {
         let is_shown = condition != Some(false);
         match piece {
-            Piece::Text(part) if is_shown => text += part,
-            Piece::Text(_) => {}
-            Piece::Value(name) => match find(name)? {
+            LinePart::Text(part) if is_shown => text += part,
+            LinePart::Text(_) => {}
+            LinePart::Value(name) => match find(name)? {
                 Some(value) if is_shown => text += &insert(line, name, value)?,
                 None if is_shown => {
                     return Err(format!(
@@ -83,15 +91,15 @@ fn fill_line(line: &str, values: &Values<'_>, insert: Insert<'_>) -> Result<Opti
                 }
                 _ => {}
             },
-            Piece::If(_) if condition.is_some() => return Err("{end} before the next {if …}".to_owned()),
-            Piece::If(name) => {
+            LinePart::If(_) if condition.is_some() => return Err("{end} before the next {if …}".to_owned()),
+            LinePart::If(name) => {
                 condition = Some(find(name)?.is_some());
                 is_shorter |= condition == Some(false);
             }
-            Piece::End if condition.is_none() => {
+            LinePart::End if condition.is_none() => {
                 return Err("{if …} before {end}, in the same line".to_owned());
             }
-            Piece::End => condition = None,
+            LinePart::End => condition = None,
         }
     }
     if condition.is_some() {
@@ -101,29 +109,29 @@ fn fill_line(line: &str, values: &Values<'_>, insert: Insert<'_>) -> Result<Opti
 }
 
 /// The parts of a line.
-fn pieces(line: &str) -> Vec<Piece<'_>> {
+fn pieces(line: &str) -> Vec<LinePart<'_>> {
     let (mut pieces, mut begin, mut at) = (Vec::new(), 0, 0);
     while let Some(found) = line[at..].find('{') {
         let brace = at + found;
         at = brace + 1;
         let is_of_shell = line[..brace].ends_with('$');
         let Some((piece, length)) = placeholder(&line[brace..]).filter(|_| !is_of_shell) else { continue };
-        pieces.extend([Piece::Text(&line[begin..brace]), piece]);
+        pieces.extend([LinePart::Text(&line[begin..brace]), piece]);
         begin = brace + length;
         at = begin;
     }
-    pieces.push(Piece::Text(&line[begin..]));
+    pieces.push(LinePart::Text(&line[begin..]));
     pieces
 }
 
 /// The placeholder with which the text begins, and its length.
-fn placeholder(text: &str) -> Option<(Piece<'_>, usize)> {
+fn placeholder(text: &str) -> Option<(LinePart<'_>, usize)> {
     let (inside, _) = text.strip_prefix('{')?.split_once('}')?;
     let is_name = |name: &str| !name.is_empty() && name.chars().all(|c| c.is_ascii_lowercase() || c == '_');
     let piece = match inside.strip_prefix("if ").map(str::trim) {
-        Some(name) if is_name(name) => Piece::If(name),
-        None if inside == "end" => Piece::End,
-        None if is_name(inside) => Piece::Value(inside),
+        Some(name) if is_name(name) => LinePart::If(name),
+        None if inside == "end" => LinePart::End,
+        None if is_name(inside) => LinePart::Value(inside),
         _ => return None,
     };
     Some((piece, inside.len() + 2))
@@ -203,7 +211,7 @@ mod tests {
             let template = parts.concat();
             if let Ok(text) = filled(&template) {
                 for line in text.lines() {
-                    let left = pieces(line).into_iter().filter(|piece| !matches!(piece, Piece::Text(_))).count();
+                    let left = pieces(line).into_iter().filter(|piece| !matches!(piece, LinePart::Text(_))).count();
                     prop_assert_eq!(left, 0, "{:?} became {:?}", template, text);
                 }
             }

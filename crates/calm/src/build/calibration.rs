@@ -7,7 +7,7 @@ use faer::{Accum, MatMut, Par};
 use super::components::BuiltComponent;
 use super::error::{BuildError, expect_length};
 use super::histogram::{BinEdges, ElementHistograms};
-use super::sorter::{BLOCK_ATOMS, ComponentBlock, Sorter};
+use super::sorter::{BLOCK_ATOMS, ComponentBlock, ComponentSorter};
 use crate::grade::DISTANCE_FLOOR;
 use crate::linear::{row_dots, view};
 
@@ -20,7 +20,7 @@ const PANEL: usize = 66;
 /// atoms, not on the batches in which they arrive.
 #[derive(Debug, Clone)]
 pub struct CalibrationPass {
-    sorter: Sorter,
+    sorter: ComponentSorter,
     sums: CalibrationSums,
 }
 
@@ -57,7 +57,7 @@ impl CalibrationPass {
             squared: Vec::with_capacity(BLOCK_ATOMS),
             histograms: ElementHistograms::empty(components.len()),
         };
-        Ok(Self { sorter: Sorter::new(dimension, centroids)?, sums })
+        Ok(Self { sorter: ComponentSorter::new(dimension, centroids)?, sums })
     }
 
     /// Adds atoms of the element: `features` is `[atoms × D]`, `weights` has one number for each atom.

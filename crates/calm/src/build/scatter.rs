@@ -5,7 +5,7 @@ use faer::{Accum, Mat, Par};
 
 use super::error::BuildError;
 use super::moments::{ComponentSums, ElementSums};
-use super::sorter::{ComponentBlock, Sorter};
+use super::sorter::{ComponentBlock, ComponentSorter};
 use crate::linear::view;
 
 /// Accumulates, for each component, the number of atoms, Σ w and Σ w **δδ**ᵀ with **δ** = **z** − **μ** about the fixed
@@ -16,7 +16,7 @@ use crate::linear::view;
 /// to the shift. The sums depend on the order of the atoms, not on the batches in which they arrive.
 #[derive(Debug, Clone)]
 pub struct ScatterPass {
-    sorter: Sorter,
+    sorter: ComponentSorter,
     sums: ScatterSums,
 }
 
@@ -32,7 +32,7 @@ impl ScatterPass {
     /// # Errors
     /// No centroid, or centroids of another dimension.
     pub fn new(dimension: usize, centroids: &[f64]) -> Result<Self, BuildError> {
-        let sorter = Sorter::new(dimension, centroids.to_vec())?;
+        let sorter = ComponentSorter::new(dimension, centroids.to_vec())?;
         let empty = || {
             let sums = ComponentSums { count: 0.0, effective_count: 0.0, scatter: Vec::new() };
             (sums, Mat::zeros(dimension, dimension))

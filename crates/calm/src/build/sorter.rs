@@ -9,7 +9,7 @@ pub(super) const BLOCK_ATOMS: usize = 128;
 
 /// The blocks of one element.
 #[derive(Debug, Clone)]
-pub(super) struct Sorter {
+pub(super) struct ComponentSorter {
     distances: CentroidDistances,
     blocks: Vec<ComponentBlock>,
 }
@@ -23,7 +23,7 @@ pub(super) struct ComponentBlock {
     pub weights: Vec<f64>,
 }
 
-impl Sorter {
+impl ComponentSorter {
     /// Centroids, `[K × D]`.
     pub fn new(dimension: usize, centroids: Vec<f64>) -> Result<Self, BuildError> {
         check_dimension(dimension)?;

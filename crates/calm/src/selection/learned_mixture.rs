@@ -56,7 +56,7 @@ struct ComponentAtoms {
 
 /// New covariances for groups of atoms.
 #[derive(Default)]
-struct Update {
+struct TriedUpdate {
     covariances: Vec<Covariance>,
     /// Largest γ of the atoms under them.
     gamma_max: f64,
@@ -135,10 +135,10 @@ impl LearnedMixture {
     }
 
     /// The update with the smallest α that brings γ below the target, or with the largest. γ only falls with α, so bisection finds it.
-    fn smallest_alpha(&self, groups: &[ComponentAtoms]) -> Result<(f64, Update), SelectionError> {
+    fn smallest_alpha(&self, groups: &[ComponentAtoms]) -> Result<(f64, TriedUpdate), SelectionError> {
         let alphas: Vec<f64> = CovarianceUpdateKind::Additive.default_alphas().into();
         let largest = alphas.len() - 1;
-        let mut found = (0.0, Update::default());
+        let mut found = (0.0, TriedUpdate::default());
         // For most structures the first is enough.
         let (mut least, mut tried, mut enough) = (0, 0, alphas.len());
         while least < enough {
@@ -169,8 +169,8 @@ impl LearnedMixture {
         groups: &[ComponentAtoms],
         limit: f64,
         covariance: impl Fn(usize) -> Vec<f64>,
-    ) -> Result<Update, SelectionError> {
-        let mut update = Update::default();
+    ) -> Result<TriedUpdate, SelectionError> {
+        let mut update = TriedUpdate::default();
         for (k, group) in groups.iter().enumerate() {
             let component = &self.components[group.place];
             let covariance = component.new_covariance(covariance(k))?;

@@ -113,12 +113,12 @@ pub(super) struct MatchedFrames<'a> {
 
 /// What became of the label of one side.
 #[derive(Clone, Copy)]
-enum LabelOutcome<'a> {
+enum SideLabel<'a> {
     Labelled(&'a ComparedFrame),
     Failed(wire::ContentHash),
 }
 
-impl LabelOutcome<'_> {
+impl SideLabel<'_> {
     fn content(&self) -> wire::ContentHash {
         match self {
             Self::Labelled(frame) => frame.content,
@@ -130,15 +130,15 @@ impl LabelOutcome<'_> {
 /// Matches by biased walk and step. Where a biased walk found several structures at one step, in several segments, the first
 /// labelled one counts, or the first failed one.
 pub(super) fn match_frames(frames: &ComparedFrames) -> MatchedFrames<'_> {
-    let mut places: BTreeMap<(u32, u64), [Option<LabelOutcome>; 2]> = BTreeMap::new();
+    let mut places: BTreeMap<(u32, u64), [Option<SideLabel>; 2]> = BTreeMap::new();
     let side = |origin: Origin| usize::from(origin == Origin::Control);
     for frame in frames.labelled() {
         let sides = places.entry((frame.place.walk, frame.at.1)).or_default();
-        sides[side(frame.place.origin)].get_or_insert(LabelOutcome::Labelled(frame));
+        sides[side(frame.place.origin)].get_or_insert(SideLabel::Labelled(frame));
     }
     for failed in frames.failed() {
         let sides = places.entry((failed.walk, failed.step)).or_default();
-        sides[side(failed.origin)].get_or_insert(LabelOutcome::Failed(failed.content));
+        sides[side(failed.origin)].get_or_insert(SideLabel::Failed(failed.content));
     }
     let mut matched = MatchedFrames {
         pairs: Vec::new(),
@@ -150,8 +150,8 @@ pub(super) fn match_frames(frames: &ComparedFrames) -> MatchedFrames<'_> {
 }
 
 impl<'a> MatchedFrames<'a> {
-    fn add(&mut self, sides: [Option<LabelOutcome<'a>>; 2]) {
-        use LabelOutcome::{Failed, Labelled};
+    fn add(&mut self, sides: [Option<SideLabel<'a>>; 2]) {
+        use SideLabel::{Failed, Labelled};
         let counts = &mut self.counts;
         match sides {
             [Some(biased), Some(control)] if biased.content() == control.content() => {

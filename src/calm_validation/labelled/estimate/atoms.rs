@@ -7,7 +7,7 @@ use atoms::Species;
 
 use super::super::collect::{SampledAtom, ScoreColumn};
 use super::super::report::{Band, ErrorHistograms, ErrorPopulation};
-use super::Values;
+use super::StatisticValues;
 
 /// The sample, sorted once for all resamplings.
 pub struct AtomStatistics {
@@ -70,7 +70,7 @@ impl AtomStatistics {
 
     /// For each column: ρ, mean area for the worst decile, retention, areas and contamination for each threshold, area for
     /// the worst decile of each element.
-    pub fn values(&self, multiplicities: &[u32]) -> Values {
+    pub fn values(&self, multiplicities: &[u32]) -> StatisticValues {
         let whole = self.ranked.statistics(multiplicities, &ERROR_THRESHOLDS);
         let of_element =
             |element: &RankedElement| element.ranked.statistics(multiplicities, &[element.threshold]);

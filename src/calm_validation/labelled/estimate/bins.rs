@@ -4,7 +4,7 @@ use analysis::{BinStatistics, BinnedErrors, Bins, Bootstrap, ForceErrors};
 
 use super::super::collect::{LARGE_ERROR, SampledAtom};
 use super::super::report::Bin;
-use super::Values;
+use super::StatisticValues;
 use super::atoms::units;
 
 /// The bins of a column. The intervals are from the sampled atoms.
@@ -19,7 +19,7 @@ pub fn with_intervals(
     let items = sampled.iter().zip(units).map(|(atom, unit)| (atom.scores[column], atom.error, unit));
     let binned = BinnedErrors::new(&Bins::for_grades(), LARGE_ERROR, items);
     let values = |BinStatistics { median, p90, large }| [median, p90, large];
-    let draw = |draw| -> Values {
+    let draw = |draw| -> StatisticValues {
         let found = binned.statistics(&bootstrap.multiplicities(draw, structures));
         found.into_iter().flat_map(values).collect()
     };

@@ -5,7 +5,7 @@ use analysis::{EnergyOffsets, LabelledEnergy};
 use super::super::collect::SampledStructure;
 use super::super::deviations::Deviations;
 use super::super::report::Offset;
-use super::Values;
+use super::StatisticValues;
 
 /// Structures that must support an offset before it is removed.
 const MIN_SUPPORT: f64 = 2.0;
@@ -53,7 +53,7 @@ impl StructureStatistics {
     }
 
     /// Mean absolute and root mean square error of each quantity.
-    pub fn values(&self, multiplicities: &[u32]) -> Values {
+    pub fn values(&self, multiplicities: &[u32]) -> StatisticValues {
         let sums = self.sums(multiplicities);
         sums.iter().flat_map(|sum| [sum.mean_absolute(), sum.root_mean_square()]).collect()
     }
