@@ -73,19 +73,19 @@ impl AseSettings {
             expected: format!("a Python file that defines calculator(), but: {error}"),
         })?;
         let environment = version_query::environment(&self.environment);
-        let versions = Versions::query(&self.command, &environment, passed, &calculator)?;
+        let versions = AseVersions::query(&self.command, &environment, passed, &calculator)?;
         Ok(Ase { settings: self.clone(), environment, calculator, versions })
     }
 }
 
 /// The versions of ASE and of the calculator's file, as the script reports them.
 #[derive(Clone, Debug, Deserialize)]
-struct Versions {
+struct AseVersions {
     ase: String,
     version: String,
 }
 
-impl Versions {
+impl AseVersions {
     fn query(
         command: &[String],
         environment: &BTreeMap<String, String>,
@@ -107,7 +107,7 @@ pub struct Ase {
     settings: AseSettings,
     environment: BTreeMap<String, String>,
     calculator: Vec<u8>,
-    versions: Versions,
+    versions: AseVersions,
 }
 
 impl DftBackend for Ase {

@@ -114,7 +114,7 @@ impl GpawSettings {
         positive("vacuum", self.vacuum)?;
         at_least("max_scf_steps", self.max_scf_steps, 1)?;
         let environment = self.environment();
-        let versions = Versions::query(&self.command, &environment, passed)?;
+        let versions = GpawVersions::query(&self.command, &environment, passed)?;
         let setups = setups::find(&versions.setup_paths, &self.pseudopotential_variants)?;
         Ok(Gpaw { settings: self.clone(), environment, versions, setups })
     }
@@ -130,13 +130,13 @@ impl GpawSettings {
 
 /// The versions and paths that GPAW reports.
 #[derive(Clone, Debug, Deserialize)]
-struct Versions {
+struct GpawVersions {
     gpaw: String,
     ase: String,
     setup_paths: Vec<PathBuf>,
 }
 
-impl Versions {
+impl GpawVersions {
     fn query(
         command: &[String],
         environment: &BTreeMap<String, String>,
@@ -156,7 +156,7 @@ impl Versions {
 pub struct Gpaw {
     settings: GpawSettings,
     environment: BTreeMap<String, String>,
-    versions: Versions,
+    versions: GpawVersions,
     setups: BTreeMap<Species, Setup>,
 }
 
