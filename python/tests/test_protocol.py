@@ -251,8 +251,8 @@ class Errors(unittest.TestCase):
             batch = small_batch()
             client.call("evaluate", batch)
             self.refused(client, client.receive(), "exception", "evaluate: energies is a list, expected a numpy array")
-            client.call("evaluate", batch, forces=False)
-            self.refused(client, client.receive(), "exception", "evaluate: energies is a list")  # with forces all the same
+            client.call("evaluate", batch, forces=False)  # it computes them all the same
+            self.refused(client, client.receive(), "exception", "evaluate: energies is a list")
             zeros = np.zeros((batch.n_atoms, 14))
             client.call("pull_back", batch, cotangents=zeros)
             self.refused(client, client.receive(), "memory", "CUDA out of memory. Tried to allocate")
