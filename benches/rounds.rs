@@ -192,6 +192,7 @@ fn walk_settings() -> WalkSettings {
         equilibration_steps: 500,
         biased_steps: 2000,
         bias_averaging_steps: 10,
+        bias_norm_interval: 1,
         barostat: BarostatSettings::default(),
         reference_steps: 0,
         cell_bias: CellBiasSettings::default(),

@@ -354,6 +354,7 @@ pub fn walk_settings(config: &Config) -> WalkSettings {
         equilibration_steps: walk.equilibration_steps,
         biased_steps: walk.biased_steps.get(),
         bias_averaging_steps: walk.bias_averaging_steps.get(),
+        bias_norm_interval: walk.bias_norm_interval.get(),
         barostat: walk.barostat.unwrap_or_default(),
         reference_steps: walk.reference_steps,
         cell_bias: walk.cell_bias.unwrap_or_default().settings(),

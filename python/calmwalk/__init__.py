@@ -12,6 +12,7 @@ _HOME = {
     "Adapter": "adapter",
     "AdapterError": "errors",
     "Batch": "batch",
+    "Energies": "adapter",
     "Evaluation": "adapter",
     "Features": "adapter",
     "Gradients": "adapter",

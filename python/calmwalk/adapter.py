@@ -76,6 +76,18 @@ class Evaluation:
 
 
 @dataclass
+class Energies:
+    """What an evaluation without forces gives."""
+
+    energies: np.ndarray
+    """[A], eV."""
+    features: np.ndarray
+    """[A, D]."""
+    compiled: bool = False
+    """Whether this call compiled code for a new shape."""
+
+
+@dataclass
 class Gradients:
     """Derivatives of H = Σ_i ē_i E_i + Σ_i z̄_i·z_i, where ē and z̄ are the cotangents of energies and features."""
 
@@ -92,6 +104,10 @@ class Adapter(Protocol):
     precision: str, threads: int, cache: Path | None)`, all from the configuration.
 
     Not a single result may depend on what else is in the batch: each atom sees its own structure only.
+
+    It may have one more method, `evaluate_without_forces(batch) -> Energies`: energies and features as of `evaluate`,
+    without the gradient that forces take. A pull-back with cotangents of energies and features then gives forces and
+    bias at once (`walk.bias_norm_interval`).
     """
 
     info: ModelInfo

@@ -18,6 +18,7 @@ from .adapter import Adapter, Evaluation
 from .batch import Batch, Counts
 from .loading import find_adapter
 from .neighbours import Structure, batch_of
+from .server import evaluates_without_forces
 
 STEP = {"double": 1e-4, "single": 1e-2}
 """Step of finite differences, Å or strain."""
@@ -43,6 +44,8 @@ class Check:
         checks: dict[str, Callable[[], float]] = {"forces": self.forces, "virials": self.virials}
         if self.info.features.form != "none":
             checks.update(gradients=self.gradients, gradient_virials=self.gradient_virials, kept_graph=self.kept_graph)
+            if evaluates_without_forces(self.adapter) is not None:
+                checks.update(without_forces=self.without_forces)
         checks.update(batch=self.batch, permutation=self.permutation, repeat=self.repeat)
         if not self.info.needs_positions:
             checks.update(padding=self.padding, beyond_cutoff=self.beyond_cutoff)
@@ -96,6 +99,23 @@ class Check:
         twice = self.adapter.pull_back(batch, cotangents, energy)
         pairs = [(kept, anew), (kept, twice)]
         return max(max(_error(a.gradients, b.gradients), _error(a.virials, b.virials)) for a, b in pairs)
+
+    def without_forces(self) -> float:
+        """Energies and features of an evaluation without forces, and a pull-back from what it kept."""
+        evaluate = evaluates_without_forces(self.adapter)
+        assert evaluate is not None
+        batch, cotangents = self._batch(), self._random_cotangents()
+        plain, n = self.adapter.evaluate(self._batch(), True), batch.real.atoms
+        found = evaluate(batch)
+        kept, anew = self.adapter.pull_back(batch, *cotangents), self.adapter.pull_back(self._batch(), *cotangents)
+        assert plain.features is not None
+        pairs = [
+            (found.energies[:n], plain.energies[:n]),
+            (found.features[:n], plain.features[:n]),
+            (kept.gradients, anew.gradients),
+            (kept.virials, anew.virials),
+        ]
+        return max(_error(a, b) for a, b in pairs)
 
     def batch(self) -> float:
         """One batch of all structures against one batch for each."""

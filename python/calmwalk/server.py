@@ -21,8 +21,9 @@ from .errors import AdapterError, InputError
 if TYPE_CHECKING:  # numpy reads the number of threads when it is imported: not before hello
     import numpy as np
 
-    from .adapter import Adapter, ModelInfo
+    from .adapter import Adapter, Energies, ModelInfo
     from .arenas import Arenas, Call
+    from .batch import Batch
 
 _THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
@@ -86,20 +87,21 @@ class Server:
             threads=threads,
             cache=protocol.as_path(message.get("cache"), "cache"),
         )
-        answer = describe(self._name, adapter.info)
+        answer = describe(self._name, adapter)
         self._adapter, self._arenas = adapter, Arenas()
         return answer
 
     def _evaluate(self, message: Mapping[str, Any]) -> dict[str, Any]:
         adapter, info = self._ready()
-        features = bool(message.get("features"))
-        names = ["energies", "forces", "virials"] + (["features"] if features else [])
+        features, forces = bool(message.get("features")), bool(message.get("forces", True))
+        names = ["energies"] + (["forces", "virials"] if forces else []) + (["features"] if features else [])
         call = self._read(message, names)
         call.arena.evaluated = call.arena.kept = None
         if features and info.features.form == "none":
             raise InputError("features are asked for, but the model has none")
+        without_forces = None if forces or not features else evaluates_without_forces(adapter)
         started = time.perf_counter()
-        result = adapter.evaluate(call.batch, features)
+        result: Any = without_forces(call.batch) if without_forces else adapter.evaluate(call.batch, features)
         seconds = time.perf_counter() - started
         self._write("evaluate", call, {name: getattr(result, name) for name in names})
         call.arena.evaluated, call.arena.kept = call.id, call.batch.kept
@@ -144,12 +146,19 @@ class Server:
         }
 
 
-def describe(name: str, info: ModelInfo) -> dict[str, Any]:
+def evaluates_without_forces(adapter: Adapter) -> Optional[Callable[[Batch], Energies]]:
+    """The method of an adapter that can leave forces out."""
+    method: Optional[Callable[[Batch], Energies]] = getattr(adapter, "evaluate_without_forces", None)
+    return method
+
+
+def describe(name: str, adapter: Adapter) -> dict[str, Any]:
     """The answer to hello."""
     import platform
 
     import numpy as np
 
+    info = adapter.info
     n = len(info.elements)
     cutoffs = np.asarray(info.cutoffs, dtype=float)
     if cutoffs.shape != (n, n):
@@ -171,6 +180,7 @@ def describe(name: str, info: ModelInfo) -> dict[str, Any]:
         },
         "precision": info.precision,
         "padding": info.padding,
+        "evaluates_without_forces": evaluates_without_forces(adapter) is not None,
         "identity": info.identity,
         "max_structures": info.max_structures,
     }

@@ -79,6 +79,7 @@ class Client:
         energy: Optional[np.ndarray] = None,
         kept: Optional[int] = None,
         features: bool = True,
+        forces: bool = True,
     ) -> int:
         """Sends evaluate or pull_back; returns its id."""
         identifier = next(self._ids)
@@ -87,7 +88,7 @@ class Client:
             inputs["feature_cotangents"] = cotangents
             if energy is not None:
                 inputs["energy_cotangents"] = energy
-        outputs = ["energies", "forces", "virials"] + (["features"] if features else [])
+        outputs = ["energies"] + (["forces", "virials"] if forces else []) + (["features"] if features else [])
         shared = self._arenas.setdefault(arena, SharedFile())
         shared.fill(
             batch, self.dimension, inputs, ["gradients", "gradient_virials"] if name == "pull_back" else outputs
@@ -105,7 +106,8 @@ class Client:
             "topology": topology,
             "sections": shared.offsets,
         }
-        message.update({"kept": kept, "energy": energy is not None} if name == "pull_back" else {"features": features})
+        wanted = {"features": features} if forces else {"features": features, "forces": False}
+        message.update({"kept": kept, "energy": energy is not None} if name == "pull_back" else wanted)
         self.send(message)
         return identifier
 

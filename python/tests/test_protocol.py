@@ -38,6 +38,7 @@ class RoundTrip(unittest.TestCase):
         self.assertEqual(hello["features"], {"form": "raw", "dimension": 14, "blocks": [8, 6]})
         self.assertRegex(hello["identity"], "^[0-9a-f]{64}$")
         self.assertIs(hello["padding"], False)
+        self.assertIs(hello["evaluates_without_forces"], True)
         self.assertLessEqual({"python", "numpy"}, set(hello["versions"]))
 
     def test_results_are_those_of_the_adapter(self) -> None:
@@ -66,6 +67,24 @@ class RoundTrip(unittest.TestCase):
                 results = self.client.results()
                 np.testing.assert_array_equal(results["gradients"], expected.gradients)
                 np.testing.assert_array_equal(results["gradient_virials"], expected.virials)
+
+    def test_forces_may_come_with_the_pull_back(self) -> None:
+        """Energies and features without forces, then one gradient of Σ E + Σ z̄·z from what was kept."""
+        batch, random = small_batch(), np.random.default_rng(3)
+        cotangents, ones = random.standard_normal((batch.n_atoms, 14)), np.ones(batch.n_atoms)
+        adapter = Radial(MODEL, {})
+        plain, gradients = adapter.evaluate(small_batch(), True), adapter.pull_back(small_batch(), cotangents)
+        evaluation = self.client.call("evaluate", batch, forces=False)
+        self.assertEqual(self.client.receive()["status"], "ok")
+        found = self.client.results()
+        self.assertEqual(set(found), {"energies", "features"})
+        np.testing.assert_array_equal(found["energies"], plain.energies)
+        np.testing.assert_array_equal(found["features"], plain.features)
+        self.client.call("pull_back", batch, cotangents=cotangents, energy=ones, kept=evaluation)
+        self.assertEqual(self.client.receive()["status"], "ok")
+        found = self.client.results()
+        np.testing.assert_allclose(found["gradients"], gradients.gradients - plain.forces, atol=1e-12)
+        np.testing.assert_allclose(found["gradient_virials"], gradients.virials - plain.virials, atol=1e-12)
 
     def test_calls_in_flight_are_answered_in_order(self) -> None:
         batch = small_batch()
@@ -217,6 +236,7 @@ class Errors(unittest.TestCase):
                 "from calmwalk.adapters.radial import Radial\n"
                 "class OutOfMemoryError(RuntimeError): pass\n"
                 "class Wrong(Radial):\n"
+                "    evaluate_without_forces = None\n"
                 "    def evaluate(self, batch, features):\n"
                 "        result = super().evaluate(batch, features)\n"
                 "        result.energies = list(result.energies)\n"
@@ -226,10 +246,13 @@ class Errors(unittest.TestCase):
                 "            sys.exit('no way')\n"
                 "        raise OutOfMemoryError('CUDA out of memory.\\nTried to allocate 2.00 GiB')\n"
             )
-            self.assertEqual(client.hello(f"{file}:Wrong", MODEL)["status"], "ok")
+            hello = client.hello(f"{file}:Wrong", MODEL)
+            self.assertEqual((hello["status"], hello["evaluates_without_forces"]), ("ok", False))
             batch = small_batch()
             client.call("evaluate", batch)
             self.refused(client, client.receive(), "exception", "evaluate: energies is a list, expected a numpy array")
+            client.call("evaluate", batch, forces=False)  # it computes them all the same
+            self.refused(client, client.receive(), "exception", "evaluate: energies is a list")
             zeros = np.zeros((batch.n_atoms, 14))
             client.call("pull_back", batch, cotangents=zeros)
             self.refused(client, client.receive(), "memory", "CUDA out of memory. Tried to allocate")

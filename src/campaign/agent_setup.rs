@@ -6,7 +6,6 @@ use bridge::PythonSettings;
 use orchestrator::selector::CampaignMode;
 
 use super::LoadedCampaign;
-use crate::config::PythonSection;
 use crate::exit_status::CommandError;
 use crate::file_hash;
 use crate::loaded_model::LoadedModel;
@@ -20,7 +19,7 @@ impl LoadedCampaign {
     pub fn agent_config(&self) -> Result<AgentConfig, CommandError> {
         let model = match &self.config.potential.python {
             None => AgentModel::Grace(self.model_files()?),
-            Some(python) => AgentModel::Python(Box::new(self.agent_python_model(python)?)),
+            Some(_) => AgentModel::Python(Box::new(self.agent_python_model()?)),
         };
         let run = &self.config.run;
         Ok(AgentConfig {
@@ -33,12 +32,11 @@ impl LoadedCampaign {
         })
     }
 
-    fn agent_python_model(&self, python: &PythonSection) -> Result<AgentPythonModel, CommandError> {
+    fn agent_python_model(&self) -> Result<AgentPythonModel, CommandError> {
         let (LoadedModel::Python(model), Some(largest)) = (&self.model, self.largest_seed_structure()) else {
             return Err(CommandError::input("the campaign has no model in Python, or no seed structure"));
         };
-        let potential = &self.config.potential;
-        let settings = python.settings(potential.model.get_ref(), potential.precision);
+        let settings = self.config.python_settings();
         let (Some(device), Some(first)) = (model.devices().first(), settings.first()) else {
             return Err(CommandError::input("the model has no device"));
         };

@@ -54,8 +54,8 @@ impl Loader<'_> {
             None => GraceModel::load_in(file.get_ref(), potential.precision, RadialPath::default())
                 .map_err(|error| wrong(error.to_string()))?
                 .into(),
-            Some(python) => {
-                let settings = python.settings(file.get_ref(), potential.precision);
+            Some(_) => {
+                let settings = self.config.python_settings();
                 let key = "potential.python".to_owned();
                 let at = location(self.path, self.text, &key);
                 let failed = |message| ConfigError::File { at, key, message };

@@ -124,6 +124,7 @@ impl FrameOutput {
         };
         let position = view.position();
         let gamma = view.gamma();
+        view.separate().map_err(CommandError::failed)?;
         trajectory.push(&TrajectoryStep {
             structure: view.structure(),
             velocities: view.velocities(),

@@ -30,6 +30,7 @@ pub fn check(config: &Config) -> Vec<InvalidValue> {
     let checks = [
         check_mixture(config),
         check_python(config),
+        check_norm_interval(config),
         check_thermostat(config),
         check_min_distances(config),
         check_zbl(config),
@@ -249,6 +250,22 @@ fn check_python(config: &Config) -> Result<(), InvalidValue> {
         return wrong("calm.artifact", "left out", expected);
     }
     Ok(())
+}
+
+/// The steps between those that measure the norms save a gradient of models in Python, in walks that do not need the virial without bias.
+fn check_norm_interval(config: &Config) -> Result<(), InvalidValue> {
+    let interval = config.walk.bias_norm_interval.get();
+    let expected = match interval {
+        1 => return Ok(()),
+        _ if config.potential.python.is_none() => {
+            "1, or [potential.python]: for GRACE models calmwalk computes both gradients in one sweep"
+        }
+        _ if config.walk.barostat.is_some() && config.walks.is_empty() => {
+            "1, or no walk.barostat: at constant pressure each step needs the virial without bias"
+        }
+        _ => return Ok(()),
+    };
+    wrong("walk.bias_norm_interval", interval, expected)
 }
 
 fn check_thermostat(config: &Config) -> Result<(), InvalidValue> {

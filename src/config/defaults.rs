@@ -51,6 +51,10 @@ pub fn bias_averaging_steps() -> NonZeroU64 {
     nonzero(10).into()
 }
 
+pub fn bias_norm_interval() -> NonZeroU64 {
+    NonZeroU64::MIN
+}
+
 /// Small against the time in which a structure becomes new, and a hundredth of the cost of a control walk at most.
 pub fn trace_interval() -> u64 {
     50

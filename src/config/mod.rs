@@ -26,6 +26,7 @@ mod warning;
 
 use std::path::{Path, PathBuf};
 
+use bridge::PythonSettings;
 use calm::UpdateSettings;
 use calm::rules::Positive;
 use orchestrator::batch::CustomScheduler;
@@ -121,6 +122,14 @@ pub struct Loaded {
 }
 
 impl Config {
+    /// The program of each device of a model in Python; none for other models.
+    pub fn python_settings(&self) -> Vec<PythonSettings> {
+        let Some(python) = &self.potential.python else { return Vec::new() };
+        let combined_gradients = self.walk.bias_norm_interval.get() > 1;
+        let settings = python.settings(self.potential.model.get_ref(), self.potential.precision);
+        settings.into_iter().map(|one| PythonSettings { combined_gradients, ..one }).collect()
+    }
+
     /// Reads and validates a configuration. Paths in it are taken relative to its own directory.
     ///
     /// # Errors

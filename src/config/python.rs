@@ -75,6 +75,7 @@ impl PythonSection {
             timeout: self.timeout.get(),
             compile_timeout: self.compile_timeout.get(),
             cache: self.cache.as_deref().map(absolute),
+            combined_gradients: false,
         };
         self.device.names().iter().map(of_device).collect()
     }
@@ -171,6 +172,34 @@ mod tests {
         assert_eq!(timeout(""), 120);
         assert_eq!(timeout(&format!("{python}\ncompile_timeout = \"5m\"\ntimeout = \"20s\"")), 320);
         assert_eq!(timeout(&format!("{python}\ncompile_timeout = \"30s\"\ntimeout = \"20s\"")), 120);
+    }
+
+    /// Which saves a gradient, except where each step needs the virial without bias.
+    #[test]
+    fn the_norms_of_the_bias_may_be_measured_seldom() {
+        let read = |interval: u64, python: &str, more: &str| {
+            let text = demo_without_refit().replacen("[calm]", &format!("{python}\n[calm]"), 1);
+            let key = "# bias_norm_interval = 1 ";
+            assert!(text.contains(key));
+            let text = text.replacen(key, &format!("bias_norm_interval = {interval}\n{more}\n#"), 1);
+            let text =
+                if more.is_empty() { text } else { text.replacen("volume_ramp =", "# volume_ramp =", 1) };
+            Config::from_draft(Path::new("c.toml"), text)
+                .map(|loaded| loaded.config)
+                .map_err(|error| error.to_string())
+        };
+        let python = "[potential.python]\nenvironment = \"venv\"\nadapter = \"mace\"";
+        let barostat = "barostat = { pressure = 1.0 }";
+        for (interval, combined) in [(1, false), (5, true)] {
+            let config = read(interval, python, "").unwrap();
+            assert_eq!(config.walk.bias_norm_interval.get(), interval);
+            assert!(config.python_settings().iter().all(|one| one.combined_gradients == combined));
+        }
+        assert!(read(1, "", "").is_ok() && read(1, python, barostat).is_ok());
+        let error = read(5, "", "").unwrap_err();
+        assert!(error.contains("walk.bias_norm_interval") && error.contains("[potential.python]"), "{error}");
+        let error = read(5, python, barostat).unwrap_err();
+        assert!(error.contains("walk.bias_norm_interval") && error.contains("walk.barostat"), "{error}");
     }
 
     #[test]

@@ -53,6 +53,10 @@ pub struct WalkSection {
     /// Number of steps over which the norms in τ_r are averaged.
     #[serde(default = "defaults::bias_averaging_steps")]
     pub bias_averaging_steps: NonZeroU64,
+    /// Number of biased steps from one that measures the norms in τ_r to the next. Those between need one gradient in place of two. Above 1
+    /// for models in Python only.
+    #[serde(default = "defaults::bias_norm_interval")]
+    pub bias_norm_interval: NonZeroU64,
     /// Number of steps between two points of the trace, which shows temperature, pressure, grade and bias along a walk. 0: none.
     #[serde(default = "defaults::trace_interval")]
     pub trace_interval: u64,

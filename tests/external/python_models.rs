@@ -118,6 +118,52 @@ fn faults_of_the_server_change_nothing() {
     assert!(status.contains("simulated on cpu") && status.contains("restart"), "{status}");
 }
 
+/// With one gradient for forces and bias in most steps, walks collect structures, whose forces are the model's alone. Walkers in processes,
+/// faults of the server and another trace change nothing.
+#[test]
+fn one_gradient_for_forces_and_bias_gives_a_campaign() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_campaign(here, &adapter("radial", ""));
+    build(here);
+    let (control, count) = (here.join("control"), here.join("count"));
+    let write = |interval: u32| {
+        let options = format!("options = {{ control = {control:?}, count = {count:?} }}");
+        write_campaign(here, &adapter("simulated", &options));
+        let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
+        let walk = format!("[walk]\nbias_norm_interval = {interval}\ntrace_interval = {}\n", 7 * interval);
+        fs::write(here.join("campaign.toml"), text.replace("[walk]\n", &walk)).unwrap();
+    };
+    write(5);
+    succeed(here, ["run", "campaign.toml", "--directory", "plain", "--in-process"]);
+    let calls = fs::read_to_string(&count).unwrap();
+    let made = |name: &str| calls.lines().filter(|line| line.split(' ').next() == Some(name)).count();
+    // Each biased step pulls back once; equilibration and control walks do not.
+    let (seldom, all) = (made("evaluate_without_forces"), made("pull_back"));
+    assert!(2 * seldom > all && seldom < all, "{seldom} of {all}");
+    fs::remove_file(&count).unwrap();
+    let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
+    fs::write(here.join("campaign.toml"), text.replace("trace_interval = 35", "trace_interval = 9")).unwrap();
+    let mut run =
+        Running(program(here).args(["run", "campaign.toml", "--directory", "disturbed"]).spawn().unwrap());
+    let (mut faults, mut last) = (0, 100);
+    while run.0.try_wait().unwrap().is_none() {
+        sleep(Duration::from_millis(20));
+        let calls = fs::read_to_string(&count).map_or(0, |text| text.lines().count());
+        if faults < 3 && calls > last + CALLS_BETWEEN {
+            fs::write(here.join("control.part"), ["exit", "nan", "memory"][faults]).unwrap();
+            fs::rename(here.join("control.part"), &control).unwrap();
+            (faults, last) = (faults + 1, calls);
+        }
+    }
+    assert!(run.0.wait().unwrap().success() && faults == 3);
+    let plain = export(here, "plain");
+    assert!(plain == export(here, "disturbed") && plain.matches("origin=biased").count() > 2, "{plain}");
+    write(6);
+    let refused = refuse(here, ["run", "campaign.toml", "--directory", "plain"]);
+    assert!(refused.contains("walk.bias_norm_interval"), "{refused}");
+}
+
 /// Two devices have half of the walkers each, and the data set has the same bytes, with walkers in processes and in one process.
 #[test]
 fn several_devices_change_nothing() {

@@ -4,6 +4,9 @@
 //! averaged (paper, Eq. hal-force). Energy and grade share one forward pass and one reverse sweep. A switched ZBL
 //! repulsion is added with its virial after the biased force, so it does not enter τ_r.
 //!
+//! Both norms need both gradients. Where they are measured in every n-th evaluation only ([`BiasedPotential::norm_interval`]), the
+//! evaluations between take their averages as they are, and need one gradient only: that of Σ E − τ_r 𝒰.
+//!
 //! The bias does not enter the virial: the cell has a bias of its own, along the direction of ∂𝒰/∂ε, which is averaged
 //! here ([`crate::cell_bias`]).
 
@@ -35,10 +38,30 @@ pub struct BiasState {
 }
 
 impl BiasState {
-    /// Adds one step's sums and ∂𝒰/∂ε to the averages and returns τ_r / τ, eV. The averages start at the first values.
-    /// The bias is zero for the first `steps` evaluations, while they settle.
-    fn advance(&mut self, force_norm: f64, gradient_norm: f64, strain: &Matrix3, steps: u64) -> f64 {
-        let weight = if self.evaluations == 0 { 1.0 } else { 1.0 / steps.max(1) as f64 };
+    /// Evaluations since the norms were last measured, if the next one measures them, with `interval` evaluations from one to the next;
+    /// `None` if it does not. While the averages settle, all do.
+    fn measures_after(&self, steps: u64, interval: u64) -> Option<u64> {
+        match self.evaluations.checked_sub(steps) {
+            None | Some(0) => Some(1),
+            Some(biased) => biased.is_multiple_of(interval.max(1)).then_some(interval.max(1)),
+        }
+    }
+
+    /// Adds sums and ∂𝒰/∂ε, measured `elapsed` evaluations after the last ones, to the averages and returns τ_r / τ, eV. The averages start
+    /// at the first values. The bias is zero for the first `steps` evaluations, while they settle.
+    fn advance(
+        &mut self,
+        (force_norm, gradient_norm): (f64, f64),
+        strain: &Matrix3,
+        steps: u64,
+        elapsed: u64,
+    ) -> f64 {
+        let weight = match elapsed {
+            _ if self.evaluations == 0 => 1.0,
+            1 => 1.0 / steps.max(1) as f64,
+            // The average keeps its time, however seldom it is measured.
+            _ => 1.0 - (1.0 - 1.0 / steps.max(1) as f64).powf(elapsed as f64),
+        };
         self.force_norm += weight * (force_norm - self.force_norm);
         self.gradient_norm += weight * (gradient_norm - self.gradient_norm);
         let direction = unit(strain);
@@ -46,8 +69,12 @@ impl BiasState {
             *mean += weight * (new - *mean);
         }
         self.evaluations += 1;
-        let silent = self.evaluations <= steps || self.gradient_norm <= 0.0;
-        if silent { 0.0 } else { self.force_norm / self.gradient_norm }
+        if self.evaluations <= steps { 0.0 } else { self.ratio() }
+    }
+
+    /// τ_r / τ by the averages, eV.
+    fn ratio(&self) -> f64 {
+        if self.gradient_norm <= 0.0 { 0.0 } else { self.force_norm / self.gradient_norm }
     }
 }
 
@@ -81,6 +108,9 @@ pub struct BiasedPotential {
     /// State of the running averages.
     pub state: BiasState,
     bias_averaging_steps: u64,
+    /// Biased evaluations from one that measures the norms of τ_r to the next. Above 1, the virial of those between contains that of the
+    /// bias, and [`BiasedPotential::separate`] must take them apart before [`BiasedPotential::physical`] and what tells of the bias.
+    pub norm_interval: u64,
     /// τ_r at the last evaluation, eV.
     scale: f64,
     pull_back: PullBack,
@@ -89,6 +119,14 @@ pub struct BiasedPotential {
     /// With the bias off.
     grades: Grades,
     physical: Evaluation,
+    /// Whether `physical` has the bias in it, as the last evaluation had one gradient for both.
+    is_combined: bool,
+    /// Evaluations since the last one that measured the norms, if the last one did.
+    measured_after: Option<u64>,
+    /// τ_r ∂𝒰/∂ε as far as it is in the virial of the last evaluation, eV.
+    bias_virial: Matrix3,
+    /// What a separation needs.
+    apart: (Evaluation, PullBack),
 }
 
 impl BiasedPotential {
@@ -113,17 +151,64 @@ impl BiasedPotential {
             tau: 0.0,
             state: BiasState::default(),
             bias_averaging_steps,
+            norm_interval: 1,
             scale: 0.0,
             pull_back: PullBack::default(),
             parts: BatchedGrades::default(),
             grades: Grades::default(),
             physical: Evaluation::default(),
+            is_combined: false,
+            measured_after: Some(1),
+            bias_virial: Matrix3::default(),
+            apart: Default::default(),
         })
+    }
+
+    /// Takes forces and bias of the last evaluation, which must have been of this structure, apart, by one more evaluation without bias if
+    /// they are known as a sum only. It changes nothing that later evaluations depend on.
+    ///
+    /// # Errors
+    /// As of an evaluation.
+    pub fn separate(
+        &mut self,
+        structure: &Structure,
+        neighbours: &NeighbourList,
+    ) -> Result<(), PotentialError> {
+        if !self.is_combined {
+            return Ok(());
+        }
+        let (alone, unused) = &mut self.apart;
+        self.potential.forward(structure, neighbours)?;
+        self.potential.backward(None, alone, unused)?;
+        let both = &self.physical;
+        // The gradient of a bias that is zero is not known, and not needed.
+        let per_scale = if self.scale == 0.0 { 0.0 } else { 1.0 / self.scale };
+        self.pull_back.gradient.clear();
+        let pairs = both.forces.iter().zip(&alone.forces);
+        self.pull_back
+            .gradient
+            .extend(pairs.map(|(both, alone)| cell::scale(cell::sub(*both, *alone), per_scale)));
+        self.bias_virial =
+            std::array::from_fn(|i| std::array::from_fn(|k| both.virial[i][k] - alone.virial[i][k]));
+        self.pull_back.virial = self.bias_virial.map(|row| row.map(|x| per_scale * x));
+        std::mem::swap(&mut self.physical, alone);
+        self.is_combined = false;
+        Ok(())
     }
 
     /// Energy, forces and virial of the potential alone at the last evaluation.
     pub fn physical(&self) -> &Evaluation {
         &self.physical
+    }
+
+    /// τ_r ∂𝒰/∂ε as far as it is in the virial of the last evaluation, eV; known as [`BiasedPotential::physical`] is.
+    pub fn bias_virial(&self) -> &Matrix3 {
+        &self.bias_virial
+    }
+
+    /// Evaluations since the last one that measured the norms of τ_r, if the last one did.
+    pub fn measured_after(&self) -> Option<u64> {
+        self.measured_after
     }
 
     /// ∂𝒰/∂ε at the last evaluation with the bias on, symmetric.
@@ -196,6 +281,10 @@ impl BiasedPotential {
         neighbours: &NeighbourList,
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
+        self.measured_after = self.state.measures_after(self.bias_averaging_steps, self.norm_interval);
+        let Some(elapsed) = self.measured_after else {
+            return self.evaluate_combined(structure, neighbours, out);
+        };
         let Self { potential, mixture, elements, parts, pull_back, .. } = self;
         parts.begin(elements.len());
         let grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
@@ -204,15 +293,39 @@ impl BiasedPotential {
         potential.evaluate_graded(structure, neighbours, &grade, out, Some(pull_back))?;
         copy(out, &mut self.physical);
         if self.parts.finish().is_ok() {
-            self.add_bias(out);
+            self.add_bias(out, elapsed);
         }
         Ok(())
     }
 
-    fn add_bias(&mut self, out: &mut Evaluation) {
-        let (force_norm, gradient_norm) = (norms(&out.forces), norms(&self.pull_back.gradient));
+    /// Forces and bias, with the norms that were measured last, as one gradient.
+    fn evaluate_combined(
+        &mut self,
+        structure: &Structure,
+        neighbours: &NeighbourList,
+        out: &mut Evaluation,
+    ) -> Result<(), PotentialError> {
+        let scale = self.tau * self.state.ratio();
+        let Self { potential, mixture, elements, parts, .. } = self;
+        parts.begin(elements.len());
+        let grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
+            parts.add(mixture, elements, atoms, features, cotangent);
+            cotangent.iter_mut().for_each(|x| *x *= -scale);
+        };
+        potential.evaluate_combined(structure, neighbours, &grade, out)?;
+        copy(out, &mut self.physical);
+        self.is_combined = true;
+        self.scale = scale;
+        if self.parts.finish().is_ok() {
+            self.state.evaluations += 1;
+        }
+        Ok(())
+    }
+
+    fn add_bias(&mut self, out: &mut Evaluation, elapsed: u64) {
+        let norms = (norms(&out.forces), norms(&self.pull_back.gradient));
         let (strain, steps) = (&self.pull_back.virial, self.bias_averaging_steps);
-        let scale = self.tau * self.state.advance(force_norm, gradient_norm, strain, steps);
+        let scale = self.tau * self.state.advance(norms, strain, steps, elapsed);
         self.scale = scale;
         for (force, gradient) in out.forces.iter_mut().zip(&self.pull_back.gradient) {
             *force = cell::add(*force, cell::scale(*gradient, scale));
@@ -235,7 +348,8 @@ impl Potential for BiasedPotential {
         neighbours: &NeighbourList,
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
-        self.scale = 0.0;
+        (self.scale, self.is_combined, self.bias_virial) = (0.0, false, Matrix3::default());
+        self.measured_after = Some(1);
         if self.tau == 0.0 {
             self.potential.evaluate(structure, neighbours, out)?;
             copy(out, &mut self.physical);

@@ -23,6 +23,9 @@ pub struct WalkSettings {
     pub biased_steps: u64,
     /// Steps over which the two norms of τ_r are exponentially averaged.
     pub bias_averaging_steps: u64,
+    /// Biased steps from one that measures these norms to the next; those between need one gradient only. Walks at constant pressure measure
+    /// them at each step, since they need the virial without bias.
+    pub bias_norm_interval: u64,
     /// Barostat of walks at constant pressure, whose pressure is in their conditions.
     pub barostat: BarostatSettings,
     /// Steps of the reference run of walks at constant pressure; 0 for none.

@@ -160,6 +160,9 @@ impl<'a> RunningWalk<'a> {
             }
         };
         potential.state = state.bias;
+        if assignment.conditions.constant_pressure.is_none() {
+            potential.norm_interval = settings.bias_norm_interval;
+        }
         let collection = settings.collection.with_threshold_factor(assignment.threshold_factor);
         Ok(Self {
             settings,
@@ -353,6 +356,11 @@ impl<'a> RunningWalk<'a> {
         self.state.next_offer = self.state.offer_after_rollback(self.step(), self.settings);
         self.save_checkpoint();
         Ok(())
+    }
+
+    /// Has the potential know forces and bias of the step apart.
+    fn separate_bias(&mut self) -> Result<(), WalkError> {
+        Ok(self.potential.separate(self.dynamics.structure(), self.dynamics.neighbours())?)
     }
 
     fn stream(&self) -> Stream {

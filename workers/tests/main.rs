@@ -9,6 +9,7 @@ mod calculations;
 mod constant_pressure;
 mod deep_models;
 mod labeller;
+mod norm_interval;
 mod trace;
 mod update_work;
 mod walk;

@@ -49,6 +49,7 @@ pub fn settings() -> WalkSettings {
         equilibration_steps: 20,
         biased_steps: 600,
         bias_averaging_steps: 10,
+        bias_norm_interval: 1,
         barostat: BarostatSettings::default(),
         reference_steps: 0,
         cell_bias: CellBiasSettings::default(),

@@ -61,7 +61,6 @@ impl Layout {
 /// A message about a batch.
 #[derive(Debug, Serialize)]
 pub(crate) struct BatchMessage<'a> {
-    call: &'static str,
     id: u64,
     arena: usize,
     path: &'a Path,
@@ -71,9 +70,8 @@ pub(crate) struct BatchMessage<'a> {
     bonds: usize,
     real: RealShape,
     topology: u64,
-    features: bool,
-    #[serde(skip_serializing_if = "is_evaluation")]
-    kept: Option<Option<u64>>,
+    #[serde(flatten)]
+    kind: BatchKind,
     sections: BTreeMap<&'static str, usize>,
 }
 
@@ -84,22 +82,23 @@ struct RealShape {
     bonds: usize,
 }
 
-fn is_evaluation(kept: &Option<Option<u64>>) -> bool {
-    kept.is_none()
-}
-
 /// What a batch is for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(tag = "call", rename_all = "snake_case")]
 pub(crate) enum BatchKind {
-    /// Energies and, if wanted, features.
+    /// Energies.
     Evaluate {
         /// Whether features are wanted.
         features: bool,
+        /// Whether forces and virials are wanted.
+        forces: bool,
     },
     /// A pull-back.
     PullBack {
         /// The message whose inputs are the same.
         kept: Option<u64>,
+        /// Whether there are cotangents of the energies.
+        energy: bool,
     },
 }
 
@@ -242,17 +241,24 @@ impl BatchArena {
         rest.fill(0.0);
     }
 
+    /// Writes cotangents of the energies: 1 for the atoms of the structures whose energy's gradient is wanted, else 0.
+    pub fn write_energy_cotangents(&mut self, wanted: impl Iterator<Item = bool>) {
+        let sizes: Vec<usize> = self.topologies.iter().map(|one| one.species.len()).collect();
+        let mut rest = self.section::<f64>("energy_cotangents");
+        for (size, is_wanted) in sizes.into_iter().zip(wanted) {
+            let (own, others) = rest.split_at_mut(size);
+            own.fill(if is_wanted { 1.0 } else { 0.0 });
+            rest = others;
+        }
+        rest.fill(0.0);
+    }
+
     /// The message for the server, without its line break.
     pub fn message(&self, id: u64, kind: BatchKind) -> String {
         let Shape { structures, atoms, bonds } = self.padded;
         let real =
             RealShape { structures: self.real.structures, atoms: self.real.atoms, bonds: self.real.bonds };
-        let (call, features, kept) = match kind {
-            BatchKind::Evaluate { features } => ("evaluate", features, None),
-            BatchKind::PullBack { kept } => ("pull_back", true, Some(kept)),
-        };
         let message = BatchMessage {
-            call,
             id,
             arena: self.number,
             path: self.arena.path(),
@@ -262,8 +268,7 @@ impl BatchArena {
             bonds,
             real,
             topology: self.topology,
-            features,
-            kept,
+            kind,
             sections: self.layout.sections.iter().map(|(name, range)| (*name, range.start)).collect(),
         };
         serde_json::to_string(&message).expect("plain data becomes JSON")
@@ -281,10 +286,10 @@ impl BatchArena {
             &all[width * first..][..width * count]
         };
         match kind {
-            BatchKind::Evaluate { features } => ResultParts {
+            BatchKind::Evaluate { features, forces } => ResultParts {
                 energies: numbers("energies", 1, first, atoms),
-                vectors: numbers("forces", 3, first, atoms),
-                virial: numbers("virials", 9, structure, 1),
+                vectors: if forces { numbers("forces", 3, first, atoms) } else { &[] },
+                virial: if forces { numbers("virials", 9, structure, 1) } else { &[] },
                 features: if features { numbers("features", dimension, first, atoms) } else { &[] },
             },
             BatchKind::PullBack { .. } => ResultParts {
@@ -302,9 +307,9 @@ impl BatchArena {
 pub(crate) struct ResultParts<'a> {
     /// `[n]`, of an evaluation.
     pub energies: &'a [f64],
-    /// Forces or gradients, `[n × 3]`.
+    /// Forces, if wanted, or gradients, `[n × 3]`.
     pub vectors: &'a [f64],
-    /// 3 × 3.
+    /// 3 × 3, with them.
     pub virial: &'a [f64],
     /// `[n × D]`, if wanted.
     pub features: &'a [f64],

@@ -40,16 +40,38 @@ pub enum Call {
     Evaluate {
         /// The structure.
         geometry: BondGeometry,
-        /// Whether the features are wanted too.
-        features: bool,
-        /// Whether the client will call for a pull-back, so that the device keeps what it needs for that.
-        pull_back_follows: bool,
+        /// What is wanted beside energies.
+        wanted: Wanted,
     },
     /// The pull-back of a cotangent of the features of the client's last structure, `[n, D]`.
     PullBack {
         /// The cotangent.
         cotangent: Vec<f64>,
+        /// Whether the gradient of the energy is in it, too.
+        with_energy: bool,
     },
+}
+
+/// What a client wants of an evaluation beside the energies.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Wanted {
+    /// Features.
+    pub features: bool,
+    /// Forces and virial.
+    pub forces: bool,
+    /// Whether the client will call for a pull-back, so that the device keeps what it needs for that.
+    pub pull_back_follows: bool,
+}
+
+impl Wanted {
+    /// Energies, forces and virial.
+    pub const FORCES: Self = Self { features: false, forces: true, pull_back_follows: false };
+    /// Features as well, without a pull-back.
+    pub const FEATURES: Self = Self { features: true, ..Self::FORCES };
+    /// All, before a pull-back.
+    pub const ALL: Self = Self { pull_back_follows: true, ..Self::FEATURES };
+    /// Features, before a pull-back that has the gradient of the energy in it.
+    pub const WITHOUT_FORCES: Self = Self { forces: false, ..Self::ALL };
 }
 
 impl Topology {
@@ -121,6 +143,7 @@ impl BondGeometry {
 /// Kinds of messages in shared memory.
 const EVALUATE: u64 = 1;
 const PULL_BACK: u64 = 2;
+const PULL_BACK_WITH_ENERGY: u64 = 3;
 /// Words before the numbers of an evaluation: kind, options, atoms, bonds + 1 or 0 where the topology is that of the last call.
 const HEAD: usize = 4;
 const CELL: usize = 9;
@@ -138,16 +161,12 @@ pub(crate) fn evaluate_words(geometry: &BondGeometry, topology: bool) -> usize {
 }
 
 /// Writes an evaluation.
-pub(crate) fn write_evaluate(
-    geometry: &BondGeometry,
-    (features, follows): (bool, bool),
-    topology: bool,
-    words: &mut [u64],
-) {
+pub(crate) fn write_evaluate(geometry: &BondGeometry, wanted: Wanted, topology: bool, words: &mut [u64]) {
     let Shape { atoms, bonds, .. } = geometry.shape();
     let periodic = geometry.periodic.iter().enumerate().map(|(k, on)| u64::from(*on) << (8 + k)).sum::<u64>();
     words[0] = EVALUATE;
-    words[1] = u64::from(features) | u64::from(follows) << 1 | periodic;
+    let Wanted { features, forces, pull_back_follows } = wanted;
+    words[1] = u64::from(features) | u64::from(pull_back_follows) << 1 | u64::from(forces) << 2 | periodic;
     words[2] = atoms as u64;
     words[3] = if topology { bonds as u64 + 1 } else { 0 };
     let (numbers, integers) = words[HEAD..].split_at_mut(3 * atoms + CELL);
@@ -166,8 +185,8 @@ pub(crate) fn write_evaluate(
 }
 
 /// Writes a pull-back, which takes one word and one for each number.
-pub(crate) fn write_pull_back(cotangent: &[f64], words: &mut [u64]) {
-    words[0] = PULL_BACK;
+pub(crate) fn write_pull_back(cotangent: &[f64], with_energy: bool, words: &mut [u64]) {
+    words[0] = if with_energy { PULL_BACK_WITH_ENERGY } else { PULL_BACK };
     cast_slice_mut::<u64, f64>(&mut words[1..]).copy_from_slice(cotangent);
 }
 
@@ -177,9 +196,14 @@ pub(crate) fn write_pull_back(cotangent: &[f64], words: &mut [u64]) {
 /// What is wrong with the message.
 pub(crate) fn read(words: &[u64], last: Option<&Arc<Topology>>) -> Result<Call, String> {
     match words.first() {
-        Some(&PULL_BACK) => Ok(Call::PullBack { cotangent: cast_slice(&words[1..]).to_vec() }),
+        Some(kind @ &(PULL_BACK | PULL_BACK_WITH_ENERGY)) => {
+            let with_energy = *kind == PULL_BACK_WITH_ENERGY;
+            Ok(Call::PullBack { cotangent: cast_slice(&words[1..]).to_vec(), with_energy })
+        }
         Some(&EVALUATE) => read_evaluate(words, last),
-        kind => Err(format!("a message of the kind {kind:?}; expected {EVALUATE} or {PULL_BACK}")),
+        kind => Err(format!(
+            "a message of the kind {kind:?}; expected {EVALUATE}, {PULL_BACK} or {PULL_BACK_WITH_ENERGY}"
+        )),
     }
 }
 
@@ -215,7 +239,9 @@ fn read_evaluate(words: &[u64], last: Option<&Arc<Topology>>) -> Result<Call, St
     let cell: [[f64; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|k| cell[3 * i + k]));
     let periodic = std::array::from_fn(|k| options >> (8 + k) & 1 == 1);
     let geometry = BondGeometry { topology, positions: positions.as_chunks().0.to_vec(), cell, periodic };
-    Ok(Call::Evaluate { geometry, features: options & 1 == 1, pull_back_follows: options & 2 == 2 })
+    let is_set = |bit: u64| options & bit == bit;
+    let wanted = Wanted { features: is_set(1), pull_back_follows: is_set(2), forces: is_set(4) };
+    Ok(Call::Evaluate { geometry, wanted })
 }
 
 #[cfg(test)]
@@ -242,18 +268,19 @@ mod tests {
 
     proptest! {
         #[test]
-        fn evaluations_survive_shared_memory(geometry in geometries(), options in any::<(bool, bool)>(), sent in any::<bool>()) {
+        fn evaluations_survive_shared_memory(geometry in geometries(), options in any::<[bool; 3]>(), sent in any::<bool>()) {
+            let [features, forces, pull_back_follows] = options;
+            let wanted = Wanted { features, forces, pull_back_follows };
             let mut words = vec![0; evaluate_words(&geometry, sent)];
-            write_evaluate(&geometry, options, sent, &mut words);
+            write_evaluate(&geometry, wanted, sent, &mut words);
             let read = read(&words, Some(&geometry.topology)).unwrap();
-            let (features, pull_back_follows) = options;
-            prop_assert_eq!(read, Call::Evaluate { geometry, features, pull_back_follows });
+            prop_assert_eq!(read, Call::Evaluate { geometry, wanted });
         }
 
         #[test]
         fn broken_messages_are_refused(geometry in geometries(), cut in 1_usize..200) {
             let mut words = vec![0; evaluate_words(&geometry, true)];
-            write_evaluate(&geometry, (true, true), true, &mut words);
+            write_evaluate(&geometry, Wanted::ALL, true, &mut words);
             words.truncate(words.len().saturating_sub(cut));
             prop_assert!(read(&words, None).is_err());
         }
@@ -261,9 +288,11 @@ mod tests {
 
     #[test]
     fn pull_backs_survive_shared_memory() {
-        let cotangent = vec![1.5, -0.25, 1e300];
-        let mut words = vec![0; 4];
-        write_pull_back(&cotangent, &mut words);
-        assert_eq!(read(&words, None).unwrap(), Call::PullBack { cotangent });
+        for with_energy in [false, true] {
+            let cotangent = vec![1.5, -0.25, 1e300];
+            let mut words = vec![0; 4];
+            write_pull_back(&cotangent, with_energy, &mut words);
+            assert_eq!(read(&words, None).unwrap(), Call::PullBack { cotangent, with_energy });
+        }
     }
 }

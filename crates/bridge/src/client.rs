@@ -7,7 +7,7 @@ use atoms::PotentialError;
 use tokio_util::sync::CancellationToken;
 use wire::ipc::{CallAddress, CallClient};
 
-use crate::call::{self, BondGeometry, Call, Topology};
+use crate::call::{self, BondGeometry, Call, Topology, Wanted};
 use crate::device::Device;
 use crate::error::CallError;
 use crate::recipient::read_answer;
@@ -88,20 +88,15 @@ impl Client {
     }
 
     /// As [`Device::call`] for an evaluation.
-    pub fn evaluate(
-        &mut self,
-        geometry: BondGeometry,
-        options: (bool, bool),
-    ) -> Result<Vec<f64>, PotentialError> {
-        let (features, pull_back_follows) = options;
+    pub fn evaluate(&mut self, geometry: BondGeometry, wanted: Wanted) -> Result<Vec<f64>, PotentialError> {
         match self {
             Self::Local { device, number } => {
-                device.call(*number, Call::Evaluate { geometry, features, pull_back_follows }).map_err(error)
+                device.call(*number, Call::Evaluate { geometry, wanted }).map_err(error)
             }
             Self::Shared { calls, known } => {
                 let is_new = known.as_ref().is_none_or(|known| !Arc::ptr_eq(known, &geometry.topology));
                 let length = call::evaluate_words(&geometry, is_new);
-                let write = |words: &mut [u64]| call::write_evaluate(&geometry, options, is_new, words);
+                let write = |words: &mut [u64]| call::write_evaluate(&geometry, wanted, is_new, words);
                 let numbers = shared(calls, length, write)?;
                 *known = Some(geometry.topology);
                 Ok(numbers)
@@ -110,13 +105,14 @@ impl Client {
     }
 
     /// As [`Device::call`] for a pull-back.
-    pub fn pull_back(&mut self, cotangent: &[f64]) -> Result<Vec<f64>, PotentialError> {
+    pub fn pull_back(&mut self, cotangent: &[f64], with_energy: bool) -> Result<Vec<f64>, PotentialError> {
         match self {
             Self::Local { device, number } => {
-                device.call(*number, Call::PullBack { cotangent: cotangent.to_vec() }).map_err(error)
+                let cotangent = cotangent.to_vec();
+                device.call(*number, Call::PullBack { cotangent, with_energy }).map_err(error)
             }
             Self::Shared { calls, .. } => {
-                let write = |words: &mut [u64]| call::write_pull_back(cotangent, words);
+                let write = |words: &mut [u64]| call::write_pull_back(cotangent, with_energy, words);
                 shared(calls, 1 + cotangent.len(), write)
             }
         }

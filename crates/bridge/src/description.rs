@@ -29,6 +29,9 @@ pub struct ModelDescription {
     pub precision: String,
     /// Whether the program is compiled for each shape of a batch.
     pub padding: bool,
+    /// Whether the adapter can leave forces out of an evaluation, and so save their gradient.
+    #[serde(default)]
+    pub evaluates_without_forces: bool,
     /// Hash of the model, of the adapter and of the definition of its features.
     pub identity: String,
     /// Largest number of structures of a batch that the adapter takes.

@@ -156,7 +156,7 @@ impl Device {
         outcome.unwrap_or_else(|| Err("the device has ended".to_owned()))
     }
 
-    /// A call of a client of this process. Returns when it has its result: energies `[n]`, forces `[n × 3]`, virial `[9]` and
+    /// A call of a client of this process. Returns when it has its result: energies `[n]`, forces `[n × 3]` and virial `[9]` if wanted, and
     /// features `[n × D]` if wanted; or gradients `[n × 3]` and their virial `[9]`.
     ///
     /// # Errors

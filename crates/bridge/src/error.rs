@@ -16,6 +16,12 @@ pub enum DeviceError {
         /// What is wrong.
         source: SelfTestError,
     },
+    /// The adapter computes forces whether they are wanted or not.
+    #[error(
+        "{0} cannot evaluate without forces, so walk.bias_norm_interval above 1 saves nothing: set it to 1, or give the adapter \
+         evaluate_without_forces (docs/python-adapters.md)"
+    )]
+    AlwaysForces(String),
     /// A file or directory cannot be written.
     #[error("cannot write {path}: {source}")]
     File {

@@ -9,7 +9,7 @@ use potentials::{ModelWithFeatures, PotentialWithFeatures};
 use tokio_util::sync::CancellationToken;
 use wire::ipc::CallAddress;
 
-use crate::call::{BondGeometry, Topology};
+use crate::call::{BondGeometry, Topology, Wanted};
 use crate::client::{Client, ClientPool, DeviceConnection};
 use crate::description::{AdapterFeatures, ModelDescription, RawFeatures};
 use crate::device::Device;
@@ -136,12 +136,15 @@ pub struct PythonPotential {
     /// As the adapter gives them.
     raw: Vec<f64>,
     mapped: MappedFeatures,
+    /// Of energies and features together.
+    combined: PullBack,
 }
 
 impl PythonPotential {
     fn new(model: Arc<PythonModel>) -> Self {
         let (energy, mapped) = (Evaluation::default(), MappedFeatures::default());
-        Self { model, client: None, topology: None, energy, raw: Vec::new(), mapped }
+        let combined = PullBack::default();
+        Self { model, client: None, topology: None, energy, raw: Vec::new(), mapped, combined }
     }
 
     fn client(&mut self) -> Result<&mut Client, PotentialError> {
@@ -152,12 +155,12 @@ impl PythonPotential {
         Ok(self.client.insert(client))
     }
 
-    /// Energies, forces, virial and, if wanted, features.
+    /// Energies, and forces, virial and features as far as they are wanted.
     fn call_evaluate(
         &mut self,
         structure: &Structure,
         neighbours: &NeighbourList,
-        (features, pull_back_follows): (bool, bool),
+        wanted: Wanted,
     ) -> Result<(), PotentialError> {
         let needed = self.model.cutoff();
         if neighbours.cutoff() < needed {
@@ -167,10 +170,12 @@ impl PythonPotential {
         let topology = Topology::from_list(&species, neighbours, self.topology.as_ref());
         self.topology = Some((neighbours.build_number(), Arc::clone(&topology)));
         let geometry = BondGeometry::from_structure(structure, topology);
-        let numbers = self.client()?.evaluate(geometry, (features, pull_back_follows))?;
+        let numbers = self.client()?.evaluate(geometry, wanted)?;
+        let Wanted { features, forces, .. } = wanted;
         let n = structure.len();
         let width = if features { self.model.description().features.dimension } else { 0 };
-        let expected = 4 * n + 9 + n * width;
+        let derivatives = if forces { 3 * n + 9 } else { 0 };
+        let expected = n + derivatives + n * width;
         if numbers.len() != expected {
             let found = numbers.len();
             return Err(PotentialError::Failed(format!(
@@ -178,13 +183,15 @@ impl PythonPotential {
             )));
         }
         let (energies, rest) = numbers.split_at(n);
-        let (forces, rest) = rest.split_at(3 * n);
-        let (virial, raw) = rest.split_at(9);
+        let (derivatives, raw) = rest.split_at(derivatives);
         self.energy.atomic_energies.clear();
         self.energy.atomic_energies.extend_from_slice(energies);
         self.energy.forces.clear();
-        self.energy.forces.extend_from_slice(forces.as_chunks().0);
-        self.energy.virial = matrix(virial);
+        if forces {
+            let (forces, virial) = derivatives.split_at(3 * n);
+            self.energy.forces.extend_from_slice(forces.as_chunks().0);
+            self.energy.virial = matrix(virial);
+        }
         self.raw.clear();
         self.raw.extend_from_slice(raw);
         if features && let Some(projection) = self.model.projection() {
@@ -193,7 +200,13 @@ impl PythonPotential {
         Ok(())
     }
 
-    fn call_pull_back(&mut self, cotangent: &[f64], out: &mut PullBack) -> Result<(), PotentialError> {
+    /// The gradient of a function with this cotangent, and of the energy if wanted.
+    fn call_pull_back(
+        &mut self,
+        cotangent: &[f64],
+        with_energy: bool,
+        out: &mut PullBack,
+    ) -> Result<(), PotentialError> {
         let mut of_raw = Vec::new();
         let cotangent = match self.model.projection() {
             None => cotangent,
@@ -202,8 +215,8 @@ impl PythonPotential {
                 &of_raw
             }
         };
-        let n = self.energy.forces.len();
-        let numbers = self.client()?.pull_back(cotangent)?;
+        let n = self.energy.atomic_energies.len();
+        let numbers = self.client()?.pull_back(cotangent, with_energy)?;
         let Some((gradient, virial)) =
             numbers.split_at_checked(3 * n).filter(|(_, virial)| virial.len() == 9)
         else {
@@ -216,6 +229,14 @@ impl PythonPotential {
         out.gradient.extend_from_slice(gradient.as_chunks().0);
         out.virial = matrix(virial);
         Ok(())
+    }
+
+    /// The cotangent of the features of the last evaluation.
+    fn cotangent(&self, grade: &GradeFunction) -> Vec<f64> {
+        let atoms: Vec<u32> = (0..self.energy.atomic_energies.len() as u32).collect();
+        let mut cotangent = vec![0.0; self.features().len()];
+        grade(&atoms, self.features(), &mut cotangent);
+        cotangent
     }
 }
 
@@ -238,7 +259,7 @@ impl Potential for PythonPotential {
         neighbours: &NeighbourList,
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
-        self.call_evaluate(structure, neighbours, (false, false))?;
+        self.call_evaluate(structure, neighbours, Wanted::FORCES)?;
         out.clone_from(&self.energy);
         Ok(())
     }
@@ -250,7 +271,7 @@ impl PotentialWithFeatures for PythonPotential {
     }
 
     fn forward(&mut self, structure: &Structure, neighbours: &NeighbourList) -> Result<(), PotentialError> {
-        self.call_evaluate(structure, neighbours, (true, false))
+        self.call_evaluate(structure, neighbours, Wanted::FEATURES)
     }
 
     fn atomic_energies(&self) -> &[f64] {
@@ -269,7 +290,7 @@ impl PotentialWithFeatures for PythonPotential {
     ) -> Result<(), PotentialError> {
         energy.clone_from(&self.energy);
         match cotangent {
-            Some(cotangent) => self.call_pull_back(cotangent, pull_back),
+            Some(cotangent) => self.call_pull_back(cotangent, false, pull_back),
             None => {
                 pull_back.reset(self.energy.forces.len());
                 Ok(())
@@ -285,16 +306,39 @@ impl PotentialWithFeatures for PythonPotential {
         energy: &mut Evaluation,
         pull_back: Option<&mut PullBack>,
     ) -> Result<(), PotentialError> {
-        self.call_evaluate(structure, neighbours, (true, pull_back.is_some()))?;
-        let atoms: Vec<u32> = (0..structure.len() as u32).collect();
-        let wants_cotangent = pull_back.is_some();
-        let mut cotangent = vec![0.0; if wants_cotangent { self.features().len() } else { 0 }];
-        grade(&atoms, self.features(), &mut cotangent);
+        let Some(pull_back) = pull_back else {
+            self.call_evaluate(structure, neighbours, Wanted::FEATURES)?;
+            let atoms: Vec<u32> = (0..structure.len() as u32).collect();
+            grade(&atoms, self.features(), &mut []);
+            energy.clone_from(&self.energy);
+            return Ok(());
+        };
+        self.call_evaluate(structure, neighbours, Wanted::ALL)?;
+        let cotangent = self.cotangent(grade);
         energy.clone_from(&self.energy);
-        match pull_back {
-            Some(pull_back) => self.call_pull_back(&cotangent, pull_back),
-            None => Ok(()),
+        self.call_pull_back(&cotangent, false, pull_back)
+    }
+
+    /// Evaluates without forces, which then come with the pull-back: one gradient in place of two.
+    fn evaluate_combined(
+        &mut self,
+        structure: &Structure,
+        neighbours: &NeighbourList,
+        grade: &GradeFunction,
+        out: &mut Evaluation,
+    ) -> Result<(), PotentialError> {
+        self.call_evaluate(structure, neighbours, Wanted::WITHOUT_FORCES)?;
+        let cotangent = self.cotangent(grade);
+        let mut gradient = std::mem::take(&mut self.combined);
+        let made = self.call_pull_back(&cotangent, true, &mut gradient);
+        if made.is_ok() {
+            out.atomic_energies.clone_from(&self.energy.atomic_energies);
+            out.forces.clear();
+            out.forces.extend(gradient.gradient.iter().map(|g| g.map(|x| -x)));
+            out.virial = gradient.virial.map(|row| row.map(|x| -x));
         }
+        self.combined = gradient;
+        made
     }
 }
 

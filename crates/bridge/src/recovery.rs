@@ -9,6 +9,7 @@ use crate::events::DeviceEvent;
 use crate::faults::ServerFault;
 use crate::same_model::{ModelReference, have_same_energies};
 use crate::schedule::{DeviceBatch, Ticket, TicketKind};
+use crate::self_test::Asked;
 use crate::server::{Server, Synchronous};
 use crate::server_loop::{CallKind, REFERENCE, ServerLoop, SuspectResult};
 
@@ -22,7 +23,7 @@ impl ServerLoop<'_> {
             return self.schedule.put_back(vec![Ticket { alone: true, ..ticket }]);
         }
         if self.suspects.is_empty() {
-            let kind = TicketKind::Evaluate { follows: false, features: false };
+            let kind = TicketKind::Evaluate { follows: false, features: false, forces: true };
             let shape = self.test_structure.shape();
             let reference =
                 Ticket { id: REFERENCE, client: REFERENCE, kind, shape, since: Instant::now(), alone: true };
@@ -223,7 +224,7 @@ impl ServerLoop<'_> {
             )));
         }
         let mut calls = Synchronous { server, setup, early, fault: None };
-        let found = calls.round_trip(0, &[&self.test_structure], None)?;
+        let found = calls.round_trip(0, &[&self.test_structure], Asked::Forces)?;
         let energies = found.into_iter().next().map(|one| one.energies).unwrap_or_default();
         reference.check(&ModelReference { description, energies }, setup.same_bits).map_err(changed)
     }

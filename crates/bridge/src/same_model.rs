@@ -100,6 +100,7 @@ pub(crate) mod tests {
             features: RawFeatures { form: AdapterFeatures::Raw, dimension: 8, blocks: vec![8] },
             precision: "double".to_owned(),
             padding: false,
+            evaluates_without_forces: false,
             identity: "aa".to_owned(),
             max_structures: None,
         };

@@ -34,9 +34,25 @@ pub enum TicketKind {
         follows: bool,
         /// Whether features are wanted.
         features: bool,
+        /// Whether forces are wanted.
+        forces: bool,
     },
     /// The pull-back of a cotangent.
-    PullBack,
+    PullBack {
+        /// Whether the gradient of the energy is in it, too.
+        with_energy: bool,
+    },
+}
+
+impl TicketKind {
+    /// Whether one batch can have both. No results of one kind depend on which others wait.
+    fn goes_with(self, other: Self) -> bool {
+        match (self, other) {
+            (Self::Evaluate { forces, .. }, Self::Evaluate { forces: others, .. }) => forces == others,
+            (Self::PullBack { with_energy }, Self::PullBack { with_energy: others }) => with_energy == others,
+            _ => false,
+        }
+    }
 }
 
 /// A call that waits.
@@ -154,7 +170,7 @@ impl Schedule {
     /// A call has come.
     pub fn add(&mut self, ticket: Ticket) {
         self.last_call.insert(ticket.client, ticket.since);
-        if ticket.kind == TicketKind::PullBack {
+        if is_pull_back(&ticket) {
             for slot in &mut self.slots {
                 let SlotState::Kept { members, arrived, .. } = slot else { continue };
                 let is_of = |(client, follows): &(u64, bool)| *follows && *client == ticket.client;
@@ -295,8 +311,10 @@ impl Schedule {
     }
 
     fn fills_a_batch(&self) -> bool {
-        let bonds: usize = self.waiting.iter().map(|ticket| ticket.shape.bonds).sum();
-        self.waiting.len() >= self.max_structures || bonds >= self.max_bonds
+        let Some(first) = self.waiting.front() else { return false };
+        let of_batch = || self.waiting.iter().filter(|ticket| first.kind.goes_with(ticket.kind));
+        let bonds: usize = of_batch().map(|ticket| ticket.shape.bonds).sum();
+        of_batch().count() >= self.max_structures || bonds >= self.max_bonds
     }
 
     /// Whether every client that takes part waits, or is in a slot.
@@ -314,7 +332,7 @@ impl Schedule {
         present.all(|(client, _)| waits(client) || in_slots(client))
     }
 
-    /// Takes calls of one kind, in the order in which they came.
+    /// Takes calls that go together, in the order in which they came.
     fn take(&mut self, slot: DeviceSlot) -> DeviceBatch {
         let mut taken: Vec<Ticket> = Vec::new();
         let mut left = VecDeque::new();
@@ -327,7 +345,7 @@ impl Schedule {
                         && self.computed_bonds(taken.len() + 1, bonds + ticket.shape.bonds) <= self.max_bonds
                         && !first.alone
                         && !ticket.alone
-                        && is_pull_back(first) == is_pull_back(&ticket)
+                        && first.kind.goes_with(ticket.kind)
                 }
             };
             if fits {
@@ -352,7 +370,7 @@ impl Schedule {
 }
 
 fn is_pull_back(ticket: &Ticket) -> bool {
-    ticket.kind == TicketKind::PullBack
+    matches!(ticket.kind, TicketKind::PullBack { .. })
 }
 
 impl DeviceBatch {

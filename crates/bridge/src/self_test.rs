@@ -15,16 +15,26 @@ const TOLERANCE: f64 = 2e-5;
 /// Largest error of a sum, in rounding errors.
 const ROUNDING: f64 = 30.0;
 
+/// What is asked of a model.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Asked<'a> {
+    /// Energies, forces, virial and features.
+    Forces,
+    /// Energies and features.
+    NoForces,
+    /// Gradients and virials of the pull-back of cotangents of the features, and of the energy if wanted.
+    Gradients {
+        /// For each structure.
+        cotangents: &'a [&'a [f64]],
+        /// Whether the energy is added.
+        with_energy: bool,
+    },
+}
+
 /// What a model evaluates at once, for the test.
 pub(crate) trait Evaluate {
-    /// The energies, vectors, virial and features of each structure, or what went wrong.
-    fn evaluate(&mut self, structures: &[&BondGeometry]) -> Result<Vec<TestResult>, String>;
-    /// Gradients and virials of the pull-back for each structure.
-    fn pull_back(
-        &mut self,
-        structures: &[&BondGeometry],
-        cotangents: &[&[f64]],
-    ) -> Result<Vec<TestResult>, String>;
+    /// The results for each structure, or what went wrong.
+    fn ask(&mut self, structures: &[&BondGeometry], asked: Asked<'_>) -> Result<Vec<TestResult>, String>;
 }
 
 /// The numbers of one structure.
@@ -83,6 +93,8 @@ pub(crate) struct TestSubject<'a> {
     pub cutoff: f64,
     /// Number of features; 0: none.
     pub dimension: usize,
+    /// Whether evaluations without forces, and pull-backs with the gradient of the energy, are tested too.
+    pub combined: bool,
     /// Rounding error of its numbers.
     pub epsilon: f64,
 }
@@ -104,6 +116,9 @@ pub(crate) fn run(
     test.permutation(&cluster)?;
     test.skin(&crystal)?;
     test.repeats(&cluster, &crystal)?;
+    if subject.combined && subject.dimension > 0 {
+        test.combined_gradients(&cluster, &crystal)?;
+    }
     test.verdict()
 }
 
@@ -131,20 +146,25 @@ impl<M: Evaluate> SelfTest<'_, M> {
         let geometries = structures.iter().map(|one| geometry(one, self.subject, skin));
         let geometries = geometries.collect::<Result<Vec<_>, _>>()?;
         let references: Vec<_> = geometries.iter().collect();
-        self.model.evaluate(&references).map_err(SelfTestError::Call)
+        self.model.ask(&references, Asked::Forces).map_err(SelfTestError::Call)
     }
 
     fn pull_back(&mut self, structure: &Structure, cotangent: &[f64]) -> Result<TestResult, SelfTestError> {
-        let results = self.pull_back_all(&[(structure, cotangent)])?;
+        let results = self.pull_back_all(&[(structure, cotangent)], false)?;
         results.into_iter().next().ok_or_else(|| SelfTestError::Call("no result".to_owned()))
     }
 
-    fn pull_back_all(&mut self, all: &[(&Structure, &[f64])]) -> Result<Vec<TestResult>, SelfTestError> {
+    fn pull_back_all(
+        &mut self,
+        all: &[(&Structure, &[f64])],
+        with_energy: bool,
+    ) -> Result<Vec<TestResult>, SelfTestError> {
         let geometries = all.iter().map(|(one, _)| geometry(one, self.subject, 0.3));
         let geometries = geometries.collect::<Result<Vec<_>, _>>()?;
         let references: Vec<_> = geometries.iter().collect();
         let cotangents: Vec<_> = all.iter().map(|(_, cotangent)| *cotangent).collect();
-        self.model.pull_back(&references, &cotangents).map_err(SelfTestError::Call)
+        let asked = Asked::Gradients { cotangents: &cotangents, with_energy };
+        self.model.ask(&references, asked).map_err(SelfTestError::Call)
     }
 
     fn compare(&mut self, what: String, error: f64, tolerance: f64) {
@@ -295,8 +315,47 @@ impl<M: Evaluate> SelfTest<'_, M> {
             self.report.is_deterministic &= first == self.pull_back(cluster, &cotangent)?;
             let of_crystal = random_numbers(crystal.len() * self.subject.dimension, 10);
             let neighbour = (crystal, &of_crystal[..]);
-            let beside = self.pull_back_all(&[neighbour, (cluster, &cotangent), neighbour])?;
+            let beside = self.pull_back_all(&[neighbour, (cluster, &cotangent), neighbour], false)?;
             self.report.is_batch_independent &= beside.get(1) == Some(&first);
+        }
+        Ok(())
+    }
+
+    /// Evaluations without forces, and one gradient of energy and features, against those apart.
+    fn combined_gradients(&mut self, cluster: &Structure, crystal: &Structure) -> Result<(), SelfTestError> {
+        let structures = [crystal.clone(), cluster.clone(), crystal.clone()];
+        let geometries = structures.iter().map(|one| geometry(one, self.subject, 0.3));
+        let geometries = geometries.collect::<Result<Vec<_>, _>>()?;
+        let references: Vec<_> = geometries.iter().collect();
+        let mut ask =
+            |which: &[&BondGeometry]| self.model.ask(which, Asked::NoForces).map_err(SelfTestError::Call);
+        let (alone, again, beside) = (ask(&references[1..2])?, ask(&references[1..2])?, ask(&references)?);
+        self.report.is_deterministic &= alone == again;
+        self.report.is_batch_independent &= alone[0] == beside[1];
+        let plain = self.evaluate(std::slice::from_ref(cluster))?.swap_remove(0);
+        let parts: [(Part, &str); 2] = [(|one| &one.energies, "energies"), (|one| &one.features, "features")];
+        for (numbers, name) in parts {
+            let error = distance(numbers(&alone[0]), numbers(&plain));
+            self.compare(format!("the {name} without forces"), error, self.same(numbers(&plain)));
+        }
+        let cotangent = random_numbers(cluster.len() * self.subject.dimension, 9);
+        let of_crystal = random_numbers(crystal.len() * self.subject.dimension, 10);
+        let (own, neighbour) = ((cluster, &cotangent[..]), (crystal, &of_crystal[..]));
+        let (first, again) = (self.pull_back_all(&[own], true)?, self.pull_back_all(&[own], true)?);
+        self.report.is_deterministic &= first == again;
+        let beside = self.pull_back_all(&[neighbour, own, neighbour], true)?;
+        self.report.is_batch_independent &= beside.get(1) == first.first();
+        let apart = self.pull_back(cluster, &cotangent)?;
+        let parts: [(Part, &str); 2] = [(|one| &one.vectors, "gradient"), (|one| &one.virial, "virial")];
+        for (numbers, name) in parts {
+            let sum: Vec<f64> = numbers(&apart)
+                .iter()
+                .zip(numbers(&plain))
+                .map(|(gradient, force)| gradient - force)
+                .collect();
+            let scale: Vec<f64> = numbers(&apart).iter().chain(numbers(&plain)).copied().collect();
+            let error = distance(numbers(&first[0]), &sum);
+            self.compare(format!("the {name} of energy and features together"), error, self.same(&scale));
         }
         Ok(())
     }

@@ -13,7 +13,7 @@ use crate::description::{AdapterFeatures, ModelDescription, PROTOCOL};
 use crate::events::DeviceEvent;
 use crate::faults::{ServerFault, ServerReply};
 use crate::process::{ServerEvent, ServerProcess};
-use crate::self_test::{Evaluate, TestResult};
+use crate::self_test::{Asked, Evaluate, TestResult};
 use crate::settings::PythonSettings;
 use crate::setup::DeviceSetup;
 use crate::shapes::Shape;
@@ -33,6 +33,34 @@ pub(crate) struct Outstanding {
     pub timeout: Duration,
 }
 
+/// What a batch is sent for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(crate) enum BatchRequest {
+    /// Energies, and features and forces if wanted.
+    Evaluate { features: bool, forces: bool },
+    /// The gradient of the features, and of the energy if wanted.
+    PullBack { with_energy: bool },
+}
+
+impl BatchRequest {
+    /// The request for which the same program is made: that is one whether the features are read or not.
+    fn program(self) -> Self {
+        match self {
+            Self::Evaluate { forces, .. } => Self::Evaluate { features: true, forces },
+            pull_back => pull_back,
+        }
+    }
+}
+
+impl From<BatchKind> for BatchRequest {
+    fn from(kind: BatchKind) -> Self {
+        match kind {
+            BatchKind::Evaluate { features, forces } => Self::Evaluate { features, forces },
+            BatchKind::PullBack { energy, .. } => Self::PullBack { with_energy: energy },
+        }
+    }
+}
+
 impl Outstanding {
     /// When its answer is overdue.
     pub fn deadline(&self) -> Instant {
@@ -47,7 +75,7 @@ pub(crate) struct Server {
     pub description: ModelDescription,
     pub arenas: [BatchArena; 2],
     /// Shapes ([`Self::program_shape`]) that were evaluated or pulled back since the start: later calls of them are quick.
-    known_shapes: HashSet<(Shape, bool)>,
+    known_shapes: HashSet<(Shape, BatchRequest)>,
     next_id: u64,
     /// Id of the last evaluation in each arena.
     evaluations: [Option<u64>; 2],
@@ -137,18 +165,22 @@ impl Server {
     pub fn send(
         &mut self,
         slot: usize,
-        evaluates: Option<bool>,
+        request: BatchRequest,
         settings: &PythonSettings,
     ) -> Result<Outstanding, ServerFault> {
         let id = self.next_id;
         self.next_id += 1;
-        let kind = match evaluates {
-            Some(features) => BatchKind::Evaluate { features },
-            None => BatchKind::PullBack { kept: self.evaluations[slot] },
+        let (kind, evaluation) = match request {
+            BatchRequest::Evaluate { features, forces } => {
+                (BatchKind::Evaluate { features, forces }, Some(id))
+            }
+            BatchRequest::PullBack { with_energy } => {
+                (BatchKind::PullBack { kept: self.evaluations[slot], energy: with_energy }, None)
+            }
         };
-        self.evaluations[slot] = evaluates.is_some().then_some(id);
+        self.evaluations[slot] = evaluation;
         let arena = &self.arenas[slot];
-        let is_known = self.known_shapes.contains(&(self.program_shape(slot), evaluates.is_some()));
+        let is_known = self.known_shapes.contains(&(self.program_shape(slot), request.program()));
         let timeout = if is_known { settings.timeout } else { settings.compile_timeout };
         let message = arena.message(id, kind);
         let sent = self.process.send(&message);
@@ -178,9 +210,9 @@ impl Server {
         names: &str,
     ) -> Result<(bool, f64), ServerFault> {
         let reply = ServerReply::read(line, Some(call.id), names)?;
-        let evaluates = matches!(call.kind, BatchKind::Evaluate { .. });
+        let program = BatchRequest::from(call.kind).program();
         self.arenas[call.slot].unlink();
-        let is_new = self.known_shapes.insert((self.program_shape(call.slot), evaluates));
+        let is_new = self.known_shapes.insert((self.program_shape(call.slot), program));
         Ok((reply.compiled || (is_new && self.description.padding), reply.seconds))
     }
 }
@@ -251,19 +283,25 @@ impl Synchronous<'_> {
         &mut self,
         slot: usize,
         structures: &[&BondGeometry],
-        cotangents: Option<&[&[f64]]>,
+        asked: Asked<'_>,
     ) -> Result<Vec<TestResult>, ServerFault> {
         let settings = &self.setup.settings;
         self.server.write(slot, structures)?;
-        if let Some(cotangents) = cotangents {
-            self.server.arenas[slot].write_cotangents(cotangents.iter().map(|one| Some(*one)));
-        }
-        let has_features = self.server.description.features.form != AdapterFeatures::None;
-        let evaluates = cotangents.is_none().then_some(has_features);
-        let call = self.server.send(slot, evaluates, settings)?;
+        let features = self.server.description.features.form != AdapterFeatures::None;
+        let request = match asked {
+            Asked::Forces => BatchRequest::Evaluate { features, forces: true },
+            Asked::NoForces => BatchRequest::Evaluate { features, forces: false },
+            Asked::Gradients { cotangents, with_energy } => {
+                let arena = &mut self.server.arenas[slot];
+                arena.write_cotangents(cotangents.iter().map(|one| Some(*one)));
+                arena.write_energy_cotangents(cotangents.iter().map(|_| with_energy));
+                BatchRequest::PullBack { with_energy }
+            }
+        };
+        let call = self.server.send(slot, request, settings)?;
         let generation = self.server.generation;
         let wait = LineReader { setup: self.setup, generation, early: self.early };
-        let what = if evaluates.is_some() { "evaluate" } else { "pull_back" };
+        let what = if matches!(request, BatchRequest::Evaluate { .. }) { "evaluate" } else { "pull_back" };
         let line = wait.line(call.deadline(), what)?;
         self.server.answer(&line, &call, &settings.names())?;
         let results = (0..structures.len()).map(|k| {
@@ -291,17 +329,8 @@ impl Synchronous<'_> {
 }
 
 impl Evaluate for Synchronous<'_> {
-    fn evaluate(&mut self, structures: &[&BondGeometry]) -> Result<Vec<TestResult>, String> {
-        let result = self.round_trip(0, structures, None);
-        self.keep_fault(result)
-    }
-
-    fn pull_back(
-        &mut self,
-        structures: &[&BondGeometry],
-        cotangents: &[&[f64]],
-    ) -> Result<Vec<TestResult>, String> {
-        let result = self.round_trip(0, structures, Some(cotangents));
+    fn ask(&mut self, structures: &[&BondGeometry], asked: Asked<'_>) -> Result<Vec<TestResult>, String> {
+        let result = self.round_trip(0, structures, asked);
         self.keep_fault(result)
     }
 }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use tracing::warn;
 
 use crate::batch_limit::LimitFile;
-use crate::call::{BondGeometry, Call};
+use crate::call::{BondGeometry, Call, Wanted};
 use crate::error::CallError;
 use crate::events::DeviceEvent;
 use crate::faults::ServerFault;
@@ -15,7 +15,7 @@ use crate::process::ServerEvent;
 use crate::recipient::Recipient;
 use crate::same_model::ModelReference;
 use crate::schedule::{DeviceBatch, NextBatch, Schedule, Ticket, TicketKind};
-use crate::server::{Outstanding, Server};
+use crate::server::{BatchRequest, Outstanding, Server};
 use crate::setup::DeviceSetup;
 
 /// The call of the reference structure.
@@ -129,12 +129,16 @@ impl ServerLoop<'_> {
         }
         let known = self.clients.get(&client).map(BondGeometry::shape);
         let accepted = call.and_then(|call| match call {
-            Call::Evaluate { geometry, features, pull_back_follows } => {
-                let kind = TicketKind::Evaluate { follows: pull_back_follows, features };
+            Call::Evaluate { geometry, wanted } => {
+                let Wanted { features, forces, pull_back_follows } = wanted;
+                let kind = TicketKind::Evaluate { follows: pull_back_follows, features, forces };
                 Ok((geometry.shape(), kind, CallKind::Evaluate { geometry, features }))
             }
-            Call::PullBack { cotangent } => match known {
-                Some(shape) => Ok((shape, TicketKind::PullBack, CallKind::PullBack { cotangent })),
+            Call::PullBack { cotangent, with_energy } => match known {
+                Some(shape) => {
+                    let work = CallKind::PullBack { cotangent };
+                    Ok((shape, TicketKind::PullBack { with_energy }, work))
+                }
                 None => Err("a pull-back before the first evaluation".to_owned()),
             },
         });
@@ -201,21 +205,30 @@ impl ServerLoop<'_> {
             Some(CallKind::PullBack { cotangent }) => Some(&cotangent[..]),
             _ => None,
         };
+        let with_energy = |ticket: &Ticket| ticket.kind == TicketKind::PullBack { with_energy: true };
         match batch {
             DeviceBatch::Evaluate { slot, tickets } => {
                 server.write(*slot, &tickets.iter().map(geometry).collect::<Vec<_>>())?;
                 let wants = |one: &Ticket| matches!(one.kind, TicketKind::Evaluate { features: true, .. });
-                server.send(*slot, Some(tickets.iter().any(wants)), settings)
+                let needs = |one: &Ticket| matches!(one.kind, TicketKind::Evaluate { forces: true, .. });
+                let (features, forces) = (tickets.iter().any(wants), tickets.iter().any(needs));
+                server.send(*slot, BatchRequest::Evaluate { features, forces }, settings)
             }
             DeviceBatch::PullBackKept { slot, tickets } => {
-                server.arenas[*slot]
-                    .write_cotangents(tickets.iter().map(|one| one.as_ref().and_then(cotangent)));
-                server.send(*slot, None, settings)
+                let arena = &mut server.arenas[*slot];
+                arena.write_cotangents(tickets.iter().map(|one| one.as_ref().and_then(cotangent)));
+                let is_with_energy = |one: &Option<Ticket>| one.as_ref().is_some_and(with_energy);
+                arena.write_energy_cotangents(tickets.iter().map(is_with_energy));
+                let with_energy = tickets.iter().any(is_with_energy);
+                server.send(*slot, BatchRequest::PullBack { with_energy }, settings)
             }
             DeviceBatch::PullBackAnew { slot, tickets } => {
                 server.write(*slot, &tickets.iter().map(geometry).collect::<Vec<_>>())?;
-                server.arenas[*slot].write_cotangents(tickets.iter().map(cotangent));
-                server.send(*slot, None, settings)
+                let arena = &mut server.arenas[*slot];
+                arena.write_cotangents(tickets.iter().map(cotangent));
+                arena.write_energy_cotangents(tickets.iter().map(with_energy));
+                let with_energy = tickets.iter().any(with_energy);
+                server.send(*slot, BatchRequest::PullBack { with_energy }, settings)
             }
         }
     }

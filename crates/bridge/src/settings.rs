@@ -36,6 +36,9 @@ pub struct PythonSettings {
     pub compile_timeout: Duration,
     /// Directory in which frameworks keep compiled programs.
     pub cache: Option<PathBuf>,
+    /// Whether biased steps have one gradient for forces and bias ([`potentials::PotentialWithFeatures::evaluate_combined`]): what that
+    /// needs is tested and prepared at the start.
+    pub combined_gradients: bool,
 }
 
 impl PythonSettings {
@@ -54,6 +57,7 @@ impl PythonSettings {
             timeout: Duration::from_secs(60),
             compile_timeout: Duration::from_secs(600),
             cache: None,
+            combined_gradients: false,
         }
     }
 

@@ -8,12 +8,12 @@ use crate::description::AdapterFeatures;
 use crate::events::DeviceEvent;
 use crate::faults::ServerFault;
 use crate::schedule::SLOTS;
-use crate::self_test::{TestResult, random_numbers};
+use crate::self_test::{Asked, TestResult, random_numbers};
 use crate::server::Synchronous;
 use crate::server_loop::ServerLoop;
 
-/// The numbers of a structure in a batch: of its evaluation, and of its pull-back if the model has features.
-type Copied = [Option<TestResult>; 2];
+/// The numbers of a structure in a batch, of each of its calls.
+type Copied = Vec<TestResult>;
 
 impl ServerLoop<'_> {
     /// Evaluates batches of one, two, four … and `most` copies, and finds how many fit into the memory. Returns whether each copy has the bits of
@@ -86,20 +86,23 @@ impl ServerLoop<'_> {
         let cotangent = random_numbers(geometry.positions.len() * dimension, 5);
         let structures = vec![geometry; copies];
         let cotangents = vec![&cotangent[..]; copies];
-        let mut all = Vec::new();
+        let gradients = |with_energy| Asked::Gradients { cotangents: &cotangents, with_energy };
+        let mut asked = vec![Asked::Forces];
+        if has_features {
+            asked.push(gradients(false));
+        }
+        if has_features && self.setup.settings.combined_gradients {
+            asked.extend([Asked::NoForces, gradients(true)]);
+        }
+        let mut all = vec![Copied::new(); SLOTS * copies];
         for slot in 0..SLOTS {
             let mut calls =
                 Synchronous { server: &mut *server, setup: self.setup, early: &mut *early, fault: None };
-            let energies = calls.round_trip(slot, &structures, None)?;
-            let gradients = match has_features {
-                true => {
-                    calls.round_trip(slot, &structures, Some(&cotangents))?.into_iter().map(Some).collect()
-                }
-                false => vec![None; copies],
-            };
-            all.extend(
-                energies.into_iter().zip(gradients).map(|(energies, gradients)| [Some(energies), gradients]),
-            );
+            for asked in &asked {
+                let results = calls.round_trip(slot, &structures, *asked)?;
+                let of_slot = all[slot * copies..].iter_mut().zip(results);
+                of_slot.for_each(|(copy, result)| copy.push(result));
+            }
         }
         Ok(all)
     }

@@ -12,7 +12,7 @@ use crate::error::DeviceError;
 use crate::faults::ServerFault;
 use crate::same_model::ModelReference;
 use crate::schedule::Schedule;
-use crate::self_test::{self, SelfTestReport, TestSubject};
+use crate::self_test::{self, Asked, SelfTestReport, TestSubject};
 use crate::server::{Server, Synchronous};
 use crate::server_loop::{REFERENCE, ServerLoop};
 use crate::setup::DeviceSetup;
@@ -69,7 +69,12 @@ fn begin<'a>(
         AdapterFeatures::Raw | AdapterFeatures::Final => description.features.dimension,
     };
     let epsilon = if description.precision == "double" { f64::EPSILON } else { f64::from(f32::EPSILON) };
-    let subject = TestSubject { elements: &elements, cutoff: description.cutoff(), dimension, epsilon };
+    let combined = setup.settings.combined_gradients;
+    if combined && !description.evaluates_without_forces {
+        return Err(DeviceError::AlwaysForces(setup.settings.names()));
+    }
+    let subject =
+        TestSubject { elements: &elements, cutoff: description.cutoff(), dimension, combined, epsilon };
     progress("testing the derivatives of the model");
     let names = || setup.settings.names();
     let refused = |source| DeviceError::SelfTest { names: names(), source };
@@ -80,7 +85,7 @@ fn begin<'a>(
         return Err(start_error(server.end(fault)));
     }
     let report = tested.map_err(refused)?;
-    let found = calls.round_trip(0, &[&test_structure], None).map_err(start_error)?;
+    let found = calls.round_trip(0, &[&test_structure], Asked::Forces).map_err(start_error)?;
     let energies = found.into_iter().next().map(|one| one.energies).unwrap_or_default();
     let limit = description.max_structures.unwrap_or(u32::MAX).min(setup.settings.max_batch.get());
     let limit_file = LimitFile::new(&setup.settings, &description);

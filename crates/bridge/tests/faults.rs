@@ -12,7 +12,7 @@ use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
 use crate::common::{Fixture, crystal};
-use crate::results::biased_step;
+use crate::results::{biased_step, combined_step};
 
 /// Each fault at an evaluation and at a pull-back, in between calls that go well.
 #[test]
@@ -35,6 +35,12 @@ fn faults_change_no_result() {
     let statistics = device.statistics();
     // Twice each: exit, hang, memory for one structure.
     assert_eq!(statistics.restarts, 6, "{statistics:?}");
+    let combined = combined_step(&mut *potential, 2, 0);
+    for first in ["exit", "nan", "print\nexit", "print\nnan"] {
+        std::fs::write(&control, first).unwrap();
+        assert!(combined_step(&mut *potential, 2, 0) == combined, "{first}");
+    }
+    assert_eq!(device.statistics().restarts, 8);
 }
 
 /// A batch that is sent ahead has its whole time from the answer of the one before it.
@@ -282,6 +288,20 @@ fn wrong_models_and_environments_are_refused() {
         let error = Fixture::new(options.clone()).device().unwrap_err().to_string();
         assert!(error.contains(expected) && error.contains("simulated"), "{options}: {error}");
     }
+    let mut fixture = Fixture::new(json!({ "bend": { "features": 1.0000001 } }));
+    fixture.device().unwrap();
+    fixture.settings.combined_gradients = true;
+    let error = fixture.device().unwrap_err().to_string();
+    assert!(error.contains("the features without forces"), "{error}");
+    fixture.settings.adapter = "calmwalk.adapters.radial:Radial".to_owned();
+    fixture.settings.options.clear();
+    fixture.device().unwrap();
+    let own = fixture.directory.path().join("always.py");
+    let text = "from calmwalk.adapters.radial import Radial\nclass Always(Radial):\n    evaluate_without_forces = None\n";
+    std::fs::write(&own, text).unwrap();
+    fixture.settings.adapter = format!("{}:Always", own.display());
+    let error = fixture.device().unwrap_err().to_string();
+    assert!(error.contains("cannot evaluate without forces") && error.contains("always.py"), "{error}");
     let mut fixture = Fixture::new(json!({}));
     fixture.settings.environment = "/nowhere/bin/python".into();
     let error = fixture.device().unwrap_err().to_string();

@@ -30,6 +30,78 @@ pub fn biased_step(
     (energy, pull_back, potential.features().to_vec())
 }
 
+/// Everything that a step with one gradient for forces and bias gives.
+pub fn combined_step(
+    potential: &mut dyn PotentialWithFeatures,
+    repeats: usize,
+    seed: usize,
+) -> (Evaluation, Vec<f64>) {
+    let structure = crystal(repeats, seed);
+    let mut list = NeighbourList::new(potential.cutoff(), 0.5);
+    list.update(&structure).unwrap();
+    let mut out = Evaluation::default();
+    let grade = |_: &[u32], features: &[f64], out: &mut [f64]| {
+        out.iter_mut().zip(features).for_each(|(out, z)| *out = (3.0 * z).cos());
+    };
+    potential.evaluate_combined(&structure, &list, &grade, &mut out).unwrap();
+    (out, potential.features().to_vec())
+}
+
+/// One gradient is the sum of the two, by calls without forces; also through shared memory, and of raw invariants behind a projection.
+#[test]
+fn one_gradient_is_the_sum_of_both() {
+    let mut fixture = Fixture::new(json!({}));
+    let count = fixture.directory.path().join("count");
+    fixture.settings.options.insert("count".to_owned(), json!(count));
+    fixture.settings.combined_gradients = true;
+    let device = fixture.device().unwrap();
+    let figures = &device.info().self_test.figures;
+    assert!(figures.iter().any(|(what, ..)| what.contains("together")), "{figures:?}");
+    assert!(device.info().self_test.is_deterministic && device.info().self_test.is_batch_independent);
+    let mut potential = Fixture::model(&device).evaluator(Threads::default());
+    let (energy, pull_back, features) = biased_step(&mut *potential, 2, 3);
+    std::fs::remove_file(&count).unwrap();
+    let (out, same_features) = combined_step(&mut *potential, 2, 3);
+    let calls = std::fs::read_to_string(&count).unwrap();
+    let names: Vec<_> = calls.lines().filter_map(|line| line.split(' ').next()).collect();
+    assert_eq!(names, ["evaluate_without_forces", "pull_back"]);
+    assert_eq!((&out.atomic_energies, &same_features), (&energy.atomic_energies, &features));
+    let sum = energy.forces.as_flattened().iter().zip(pull_back.gradient.as_flattened()).map(|(f, g)| f - g);
+    let error = out.forces.as_flattened().iter().zip(sum).map(|(found, sum)| (found - sum).abs());
+    assert!(error.fold(0.0, f64::max) < 1e-12);
+    let sum = energy.virial.as_flattened().iter().zip(pull_back.virial.as_flattened()).map(|(f, g)| f - g);
+    let error = out.virial.as_flattened().iter().zip(sum).map(|(found, sum)| (found - sum).abs());
+    assert!(error.fold(0.0, f64::max) < 1e-10);
+}
+
+/// Steps with one gradient and with two have the same bits beside each other as alone, and no batch has both.
+#[test]
+fn both_kinds_of_steps_share_a_device() {
+    let fixture = Fixture::new(json!({ "base_seconds": 0.005 }));
+    let device = fixture.device().unwrap();
+    let model = Fixture::model(&device);
+    let evaluator = || Arc::clone(&model).evaluator(Threads::default());
+    let alone: Vec<_> = (0..12)
+        .map(|k| {
+            (biased_step(&mut *evaluator(), 1 + k % 2, k), combined_step(&mut *evaluator(), 1 + k % 2, k))
+        })
+        .collect();
+    std::thread::scope(|scope| {
+        for (k, (two, one)) in alone.iter().enumerate() {
+            let mut potential = evaluator();
+            scope.spawn(move || {
+                for round in 0..6 {
+                    match (k + round) % 3 {
+                        0 => assert!(biased_step(&mut *potential, 1 + k % 2, k) == *two),
+                        _ => assert!(combined_step(&mut *potential, 1 + k % 2, k) == *one),
+                    }
+                }
+            });
+        }
+    });
+    assert!(device.statistics().largest_batch > 1);
+}
+
 #[test]
 fn gradients_of_graded_features_are_derivatives() {
     let fixture = Fixture::new(json!({}));
@@ -115,6 +187,7 @@ fn shared_memory_changes_nothing() {
                 for round in 0..4 {
                     let seed = k + round / 2;
                     assert!(biased_step(&mut *local, 2, seed) == biased_step(&mut *shared, 2, seed));
+                    assert!(combined_step(&mut *local, 2, seed) == combined_step(&mut *shared, 2, seed));
                 }
             });
         }

@@ -3,7 +3,7 @@
 use std::fmt::Debug;
 use std::sync::Arc;
 
-use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
+use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, cell};
 
 use crate::grace::{Grace, GraceModel, GradeFunction, Instructions, PullBack, Threads};
 
@@ -82,6 +82,28 @@ pub trait PotentialWithFeatures: Potential + Sync {
         energy: &mut Evaluation,
         pull_back: Option<&mut PullBack>,
     ) -> Result<(), PotentialError>;
+
+    /// Energies, features, and as forces and virial −∂/∂r and −∂/∂ε of Σ E + H together, for a cotangent ∂H/∂z as in
+    /// [`PotentialWithFeatures::evaluate_graded`]. What it saves is up to the potential.
+    ///
+    /// # Errors
+    /// As [`PotentialWithFeatures::forward`].
+    fn evaluate_combined(
+        &mut self,
+        structure: &Structure,
+        neighbours: &NeighbourList,
+        grade: &GradeFunction,
+        out: &mut Evaluation,
+    ) -> Result<(), PotentialError> {
+        let mut pull_back = PullBack::default();
+        self.evaluate_graded(structure, neighbours, grade, out, Some(&mut pull_back))?;
+        for (force, gradient) in out.forces.iter_mut().zip(&pull_back.gradient) {
+            *force = cell::sub(*force, *gradient);
+        }
+        let both = out.virial.as_flattened_mut().iter_mut().zip(pull_back.virial.as_flattened());
+        both.for_each(|(virial, of_features)| *virial -= of_features);
+        Ok(())
+    }
 }
 
 impl ModelWithFeatures for GraceModel {

@@ -21,6 +21,7 @@ from typing import Any, Callable, Optional
 import numpy as np
 
 from ..adapter import (
+    Energies,
     Evaluation,
     Features,
     Gradients,
@@ -58,7 +59,7 @@ class Gracemaker:
         self._device = _tensorflow_device(tf, device)
         with tf.device(self._device):
             self._graph = _Graph(tf, yaml, checkpoint, spec, tf.float32 if precision == "single" else tf.float64)
-        self._evaluate, self._pull_back = self._graph.functions()
+        self._evaluate, self._evaluate_without_forces, self._pull_back = self._graph.functions()
         self._shapes: set[tuple[str, int, int, int]] = set()
         elements, cutoffs = self._graph.elements_and_cutoffs()
         blocks = self._graph.blocks()
@@ -81,6 +82,12 @@ class Gracemaker:
             energies, values, forces, virials = self._evaluate(*self._tensors(batch))
         values = values.numpy() if features else None
         return Evaluation(energies.numpy(), values, forces.numpy(), virials.numpy(), compiled)
+
+    def evaluate_without_forces(self, batch: Batch) -> Energies:
+        compiled = self._is_new("evaluate_without_forces", batch)
+        with self._tf.device(self._device):
+            energies, values = self._evaluate_without_forces(*self._tensors(batch))
+        return Energies(energies.numpy(), values.numpy(), compiled)
 
     def pull_back(
         self, batch: Batch, feature_cotangents: np.ndarray, energy_cotangents: Optional[np.ndarray] = None
@@ -135,9 +142,9 @@ class _Graph:
         """Columns of the basis of each layer."""
         return [sum(_columns(reduce, source) for source in reduce.instructions) for reduce in self._reduces]
 
-    def functions(self) -> tuple[Callable[..., Any], Callable[..., Any]]:
-        """Compiled functions of the inputs: energies, features, forces, virials; and, with cotangents of energies and
-        features, gradients by position and strain."""
+    def functions(self) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
+        """Compiled functions of the inputs: energies, features, forces, virials; energies and features; and, with
+        cotangents of energies and features, gradients by position and strain."""
         tf = self._tf
         signature = [self._input(name) for name in _INPUTS]
         cotangents = [tf.TensorSpec([None], tf.float64), tf.TensorSpec([None, None], tf.float64)]
@@ -150,6 +157,9 @@ class _Graph:
             gradients, strain = self._scatter(data, tape.gradient(energies, data["bonds"]))
             return energies, features, -gradients, -strain
 
+        def evaluate_without_forces(*inputs: Any) -> Any:
+            return tuple(self._run(dict(zip(_INPUTS, inputs))))
+
         def pull_back(*inputs: Any) -> Any:
             data = dict(zip(_INPUTS, inputs))
             with tf.GradientTape() as tape:
@@ -159,6 +169,7 @@ class _Graph:
 
         return (
             tf.function(evaluate, input_signature=signature, jit_compile=True),
+            tf.function(evaluate_without_forces, input_signature=signature, jit_compile=True),
             tf.function(pull_back, input_signature=signature + cotangents, jit_compile=True),
         )
 

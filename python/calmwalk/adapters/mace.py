@@ -17,6 +17,7 @@ from typing import Any, Optional
 import numpy as np
 
 from ..adapter import (
+    Energies,
     Evaluation,
     Features,
     Gradients,
@@ -79,6 +80,10 @@ class Mace:
         batch.kept = graph if features else None
         values = _numpy(graph.features) if features else None
         return Evaluation(_numpy(graph.energies), values, -forces, -virials, compiled)
+
+    def evaluate_without_forces(self, batch: Batch) -> Energies:
+        batch.kept = graph = self._forward(batch)
+        return Energies(_numpy(graph.energies), _numpy(graph.features), self._warming)
 
     def pull_back(
         self, batch: Batch, feature_cotangents: np.ndarray, energy_cotangents: Optional[np.ndarray] = None

@@ -26,6 +26,7 @@ from typing import Any, Optional
 import numpy as np
 
 from ..adapter import (
+    Energies,
     Evaluation,
     Features,
     Gradients,
@@ -108,6 +109,11 @@ class Radial:
         batch.kept = near, slopes
         gradients, strain = self._scatter(batch, near, slopes)
         return Evaluation(energies, values if features else None, -gradients, -strain)
+
+    def evaluate_without_forces(self, batch: Batch) -> Energies:
+        near, values, energies, slopes = self._forward(batch)
+        batch.kept = near, slopes
+        return Energies(energies, values)
 
     def pull_back(
         self, batch: Batch, feature_cotangents: np.ndarray, energy_cotangents: Optional[np.ndarray] = None

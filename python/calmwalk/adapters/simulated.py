@@ -10,7 +10,8 @@ Options, all with a default that does nothing:
 - `padding`: ask for padded batches
 - `max_structures`: what hello reports
 - `memory_above`: a call with more structures than this is out of memory
-- `fault`, `fault_call`, `fault_at`: a fault at the n-th call (from 1) of a kind: hello, evaluate (default) or pull_back
+- `fault`, `fault_call`, `fault_at`: a fault at the n-th call (from 1) of a kind: hello, evaluate (default),
+  evaluate_without_forces or pull_back
 - `exit_at_atoms`: the process ends with status 3 at a call with a structure of so many atoms
 - `control`: path of a file, looked for at each evaluate and pull_back. It has a fault a line; it is removed when it
   is read, and its faults happen at this and the next calls, one at each. "memory_above 8" and "base_seconds 0.5" set
@@ -18,14 +19,14 @@ Options, all with a default that does nothing:
 - `count`: path of a file to which each call appends a line: kind, structures, atoms, bonds (with padding), real
   structures
 - `bend`: {"forces": 1.1, …} multiplies a result (forces, virials, gradients, gradient_virials) by a factor: a model
-  with wrong derivatives
+  with wrong derivatives; `features` those of an evaluation without forces
 - `noise`: relative noise of the energies, another in each call: a model that is not deterministic
 - `order`: energies differ by this times the atom's index: a model that permutations change
 - `crowd`, `crowd_gradients`: energies, or gradients, differ by this times the number of structures beyond
   `crowd_above`: a model that the composition of a batch changes
 
 Faults: "exit" (the process ends with status 3), "hang" (sleeps without end), "slow" (ten seconds more), "nan" (the
-first force, or gradient, is not a number), "shape" (forces, or gradients, of one atom less), "type" (of whole
+first force, gradient, or, without forces, feature is not a number), "shape" (these of one atom less), "type" (of whole
 numbers), "exception", "memory", "import" (of a module that does not exist), "print" (writes to standard output, which
 must not harm).
 """
@@ -42,7 +43,7 @@ from typing import Any, Optional
 
 import numpy as np
 
-from ..adapter import Evaluation, Gradients, check_options
+from ..adapter import Energies, Evaluation, Gradients, check_options
 from ..batch import Batch
 from ..errors import InputError
 from .radial import Radial
@@ -106,6 +107,16 @@ class Simulated:
         bend = self._options["bend"]
         result.forces = _spoil(fault, result.forces * bend.get("forces", 1.0))
         result.virials = result.virials * bend.get("virials", 1.0)
+        result.energies = self._disturb(result.energies, batch)
+        result.compiled = compiled
+        self._end(started, batch, compiled)
+        return result
+
+    def evaluate_without_forces(self, batch: Batch) -> Energies:
+        started = time.monotonic()
+        fault, compiled = self._begin("evaluate_without_forces", batch)
+        result = self._radial.evaluate_without_forces(batch)
+        result.features = _spoil(fault, result.features * self._options["bend"].get("features", 1.0))
         result.energies = self._disturb(result.energies, batch)
         result.compiled = compiled
         self._end(started, batch, compiled)

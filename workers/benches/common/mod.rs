@@ -100,6 +100,7 @@ fn settings(threshold: f64, ensemble: Ensemble) -> WalkSettings {
         equilibration_steps: EQUILIBRATION,
         biased_steps: 10_000_000,
         bias_averaging_steps: 10,
+        bias_norm_interval: 1,
         barostat: BarostatSettings::default(),
         reference_steps: 0,
         cell_bias,

@@ -13,6 +13,7 @@ impl RunningWalk<'_> {
         let structure = self.dynamics.structure().clone();
         let pairs = self.pairs(self.dynamics.neighbours());
         let gamma_nbr = neighbourhood_average(&gamma, pairs).expect("pairs of these very atoms");
+        self.separate_bias()?;
         let physical = self.potential.physical();
         let id = CandidateId {
             campaign: self.assignment.campaign,

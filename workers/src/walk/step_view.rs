@@ -1,6 +1,6 @@
 //! A step of a walk, for observers.
 
-use atoms::{Evaluation, Structure, Vec3};
+use atoms::{Evaluation, PotentialError, Structure, Vec3};
 use wire::messages::PathPosition;
 
 use super::{RunningWalk, gamma};
@@ -39,6 +39,15 @@ impl StepView<'_, '_> {
     /// u.
     pub fn masses(&self) -> &[f64] {
         self.walk.dynamics.masses()
+    }
+
+    /// Takes the forces of the potential and of the bias apart, for [`StepView::physical`].
+    ///
+    /// # Errors
+    /// A potential that cannot be evaluated any more.
+    pub fn separate(&mut self) -> Result<(), PotentialError> {
+        let RunningWalk { potential, dynamics, .. } = &mut *self.walk;
+        potential.separate(dynamics.structure(), dynamics.neighbours())
     }
 
     /// Energy, forces and virial of the potential, without bias and ZBL, as candidates have them.

@@ -1,7 +1,7 @@
 //! The points of a walk's trace ([`wire::TracePoint`]), and the work of its bias.
 
-use atoms::Structure;
 use atoms::units::GPA_PER_EV_A3;
+use atoms::{Matrix3, Structure};
 use calm::grade::maximum;
 use wire::{MAX_KEPT_POINTS, TracePoint, thin};
 
@@ -9,11 +9,14 @@ use super::{RunningWalk, WalkError, gamma};
 use crate::cell_bias::CellBias;
 
 impl RunningWalk<'_> {
-    /// Counts the work of the bias in the step that was just made, and adds a point if one is due.
+    /// Counts the work of the bias up to the step that was just made, if the power of the bias is known there, and adds a point if one is
+    /// due.
     pub(super) fn trace_step(&mut self) -> Result<(), WalkError> {
-        let power = self.potential.bias_power(&self.dynamics.state().velocities);
-        let time_step = self.dynamics.checkpoint().time_step;
-        self.potential.state.work.advance(power, time_step);
+        if let Some(steps) = self.potential.measured_after() {
+            let power = self.potential.bias_power(&self.dynamics.state().velocities);
+            let time_step = self.dynamics.checkpoint().time_step;
+            self.potential.state.work.advance(power, steps as f64 * time_step);
+        }
         self.trace_if_due()
     }
 
@@ -47,14 +50,18 @@ impl RunningWalk<'_> {
             // The walk continues, or ends where its grades are needed.
             Err(_) => None,
         };
-        let pressure = self.dynamics.pressure_tensor();
+        self.separate_bias()?;
+        let trace = |tensor: &Matrix3| tensor[0][0] + tensor[1][1] + tensor[2][2];
+        // The dynamics know no virial of the bias.
+        let of_bias = trace(self.potential.bias_virial()) / self.dynamics.structure().cell.volume();
+        let pressure = self.dynamics.pressure_tensor().map(|pressure| trace(&pressure) - of_bias);
         Ok(TracePoint {
             number: self.state.trace_points,
             segment: self.state.segment,
             step: self.step(),
             time: self.step() as f64 * self.dynamics.checkpoint().time_step,
             temperature: self.dynamics.temperature(),
-            pressure: pressure.map(|p| GPA_PER_EV_A3 * (p[0][0] + p[1][1] + p[2][2]) / 3.0),
+            pressure: pressure.map(|pressure| GPA_PER_EV_A3 * pressure / 3.0),
             relative_volume: self.relative_volume(),
             cell: cell(self.dynamics.structure()),
             conserved_energy: self.dynamics.conserved_energy(),

@@ -9,6 +9,11 @@ use super::*;
 const CLIENTS: u64 = 6;
 const MOST: usize = 3;
 
+/// Whether a client's calls are those with forces, or those with one gradient for forces and bias.
+fn has_forces(client: u64) -> bool {
+    client <= 4
+}
+
 /// What happens to a schedule.
 #[derive(Clone, Copy, Debug)]
 enum Step {
@@ -61,8 +66,8 @@ impl Simulation {
             return;
         }
         let kind = match biased && self.evaluated.contains_key(&client) {
-            true => TicketKind::PullBack,
-            false => TicketKind::Evaluate { follows: biased, features: true },
+            true => TicketKind::PullBack { with_energy: !has_forces(client) },
+            false => TicketKind::Evaluate { follows: biased, features: true, forces: has_forces(client) },
         };
         let shape = Shape { structures: 1, atoms: 4, bonds: 10 };
         let (id, since) = (self.next_id, self.now);
@@ -81,7 +86,7 @@ impl Simulation {
                 for ticket in batch.tickets() {
                     assert!(self.open.remove(&(ticket.id, ticket.client)), "answered twice: {ticket:?}");
                     match ticket.kind {
-                        TicketKind::PullBack => self.evaluated.remove(&ticket.client),
+                        TicketKind::PullBack { .. } => self.evaluated.remove(&ticket.client),
                         TicketKind::Evaluate { .. } => self.evaluated.insert(ticket.client, ticket.id),
                     };
                 }
@@ -104,13 +109,11 @@ impl Simulation {
         while let NextBatch::Send(batch) = self.schedule.next(self.now) {
             let tickets = batch.tickets();
             assert!(!tickets.is_empty() && tickets.len() <= MOST, "{batch:?}");
-            assert!(
-                tickets.len() == 1
-                    || tickets.iter().all(|one| !one.alone || one.kind == TicketKind::PullBack)
-            );
-            let is_pull_back = !matches!(batch, DeviceBatch::Evaluate { .. });
+            assert!(tickets.len() == 1 || tickets.iter().all(|one| !one.alone || is_pull_back(one)));
+            let pulls_back = !matches!(batch, DeviceBatch::Evaluate { .. });
             for ticket in &tickets {
-                assert_eq!(ticket.kind == TicketKind::PullBack, is_pull_back, "{batch:?}");
+                assert_eq!(is_pull_back(ticket), pulls_back, "{batch:?}");
+                assert!(ticket.kind.goes_with(tickets[0].kind), "{batch:?}");
             }
             self.check_places(&batch);
             self.sent.push_back(batch);
@@ -215,7 +218,7 @@ fn padding_counts_as_bonds() {
         let mut schedule = Schedule::new(8, padding);
         schedule.limit_bonds(50);
         let shape = Shape { structures: 1, atoms: 4, bonds: 10 };
-        let kind = TicketKind::Evaluate { follows: true, features: true };
+        let kind = TicketKind::Evaluate { follows: true, features: true, forces: true };
         let now = Instant::now();
         (1..9).for_each(|id| schedule.add(Ticket { id, client: id, kind, shape, since: now, alone: false }));
         let NextBatch::Send(batch) = schedule.next(now) else { panic!("nothing is sent") };
@@ -246,6 +249,22 @@ fn the_wait_for_pull_backs_grows_with_the_evaluation() {
     let until = now + Duration::from_millis(40);
     assert_eq!(simulation.schedule.next(now), NextBatch::WaitUntil(until));
     assert_eq!(simulation.schedule.next(until), NextBatch::Wait, "it is given up");
-    simulation.schedule.add(Ticket { kind: TicketKind::PullBack, ..simulation.sent[0].tickets()[0] });
+    let kind = TicketKind::PullBack { with_energy: false };
+    simulation.schedule.add(Ticket { kind, ..simulation.sent[0].tickets()[0] });
     assert!(matches!(simulation.schedule.next(until), NextBatch::Send(DeviceBatch::PullBackAnew { .. })));
+}
+
+/// Calls without forces do not fill a batch of calls with them, nor go ahead in one.
+#[test]
+fn calls_of_two_kinds_have_batches_of_their_own() {
+    let (mut schedule, now) = (Schedule::new(MOST, false), Instant::now());
+    let shape = Shape { structures: 1, atoms: 4, bonds: 10 };
+    for client in [1, 5, 2, 6] {
+        let kind = TicketKind::Evaluate { follows: true, features: true, forces: has_forces(client) };
+        schedule.add(Ticket { id: client, client, kind, shape, since: now, alone: false });
+    }
+    for expected in [[1, 2], [5, 6]] {
+        let NextBatch::Send(batch) = schedule.next(now) else { panic!("nothing is sent") };
+        assert_eq!(batch.tickets().iter().map(|one| one.client).collect::<Vec<_>>(), expected);
+    }
 }

@@ -15,7 +15,7 @@ fn copper() -> Structure {
 }
 
 fn ase(moments: InitialMagneticMoments) -> Ase {
-    let versions = Versions { ase: "3.22.1".into(), version: "mine".into() };
+    let versions = AseVersions { ase: "3.22.1".into(), version: "mine".into() };
     let settings = AseSettings { initial_magnetic_moments: moments, ..AseSettings::default() };
     Ase { environment: BTreeMap::new(), settings, calculator: b"def calculator(): ...".to_vec(), versions }
 }

@@ -21,7 +21,7 @@ fn silicon() -> Structure {
 
 fn gpaw(settings: GpawSettings) -> Gpaw {
     let versions =
-        Versions { gpaw: "22.8.0".into(), ase: "3.22.1".into(), setup_paths: vec!["/setups".into()] };
+        GpawVersions { gpaw: "22.8.0".into(), ase: "3.22.1".into(), setup_paths: vec!["/setups".into()] };
     let setup = Setup { pinned: PinnedFile::fake("/setups/Si.PBE", "abc"), valence: 4.0 };
     let setups = BTreeMap::from([("Si".parse().unwrap(), setup)]);
     Gpaw { environment: settings.environment(), settings, versions, setups }
