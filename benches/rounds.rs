@@ -100,13 +100,14 @@ struct RunningAssignment(Duration, u64, AssignmentReport);
 impl Campaign {
     fn run(settings: SelectorSettings, walkers: usize, seeds: Vec<SeedStructurePlan>) -> Self {
         let model = Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap());
+        let walks: usize = seeds.iter().map(|seed| seed.walks.len()).sum();
+        let mut selector = selector(settings, seeds, &model);
         let context = WalkContext {
             model: model.clone(),
             threads: Threads::default(),
             settings: Arc::new(walk_settings()),
+            original: Arc::clone(selector.original()),
         };
-        let walks: usize = seeds.iter().map(|seed| seed.walks.len()).sum();
-        let mut selector = selector(settings, seeds, &model);
         selector.start_walks();
         let (mut campaign, mut running, mut number) = (Self::default(), BinaryHeap::new(), 0);
         let (mut work, mut begun, mut has_control) = (Duration::ZERO, BTreeSet::new(), false);

@@ -71,7 +71,8 @@ pub async fn rerun(
     settings.trace_interval = 0;
     settings.guard.max_temperature = f64::INFINITY;
     let threads = Threads::new(cores() as usize).map_err(CommandError::failed)?;
-    let context = WalkContext { model: model.shared(), threads, settings: Arc::new(settings) };
+    let (settings, original) = (Arc::new(settings), Arc::new(artifact.mixture.clone()));
+    let context = WalkContext { model: model.shared(), threads, settings, original };
     let mixtures = MixtureStream::open(store, &artifact, begin.as_ref()).await?;
     let assignment = first_assignment(store, &record).await?;
     Rerun { store, context, mixtures, assignment, on_step }.run(&parts, stopping).await

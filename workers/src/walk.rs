@@ -44,6 +44,8 @@ pub struct WalkContext {
     pub threads: Threads,
     /// The settings.
     pub settings: Arc<WalkSettings>,
+    /// The original mixture of the walks' version of the potential, for their traces.
+    pub original: Arc<Mixture>,
 }
 
 /// Runs an assignment until it ends: with a candidate, at its last step, with the end of the walk, or when
@@ -132,6 +134,7 @@ struct RunningWalk<'a> {
     collection: CollectionRule,
     dynamics: Dynamics,
     potential: BiasedPotential,
+    original: &'a Mixture,
     state: WalkState,
     trace: Vec<TracePoint>,
 }
@@ -142,7 +145,7 @@ impl<'a> RunningWalk<'a> {
         assignment: &'a Assignment,
         mixture: Arc<Mixture>,
     ) -> Result<Self, WalkError> {
-        let WalkContext { model, threads, settings } = context;
+        let WalkContext { model, threads, settings, original } = context;
         let species = &assignment.seed_structure.species;
         let zbl = settings.zbl.as_ref().map(|windows| Zbl::new(species, windows)).transpose()?;
         let mixture_version = mixture.version();
@@ -169,6 +172,7 @@ impl<'a> RunningWalk<'a> {
             collection,
             dynamics,
             potential,
+            original,
             state,
             trace: Vec::new(),
         })

@@ -142,7 +142,8 @@ async fn orchestrate() {
     let place = ShmDir::for_campaign(directory.path()).expect("a place");
     let sizes = Sizes { walkers: 1, message_bytes: 5 << 20 };
     let prepared = place.prepare(space_needed(&sizes)).expect("enough shared memory");
-    let mixtures = SharedMixture::create(&place.mixture(), &mixture(), 1).expect("a shared mixture");
+    let mut mixtures = SharedMixture::create(&place.mixture(), &mixture(), 1).expect("a shared mixture");
+    mixtures.publish_original(&mixture()).expect("room for it");
     let server = IpcServer::open(&place, sizes, 1).expect("a transport");
     let handle = server.handle();
     handle.expect(0, 1);

@@ -21,7 +21,7 @@ use crate::messages::{Assignment, AssignmentReport, AssignmentStart, Outcome, Wa
 use crate::walk_trace::TracePoint;
 
 const MAGIC: [u8; 4] = *b"CALM";
-const VERSION: u8 = 5;
+const VERSION: u8 = 6;
 const PREFIX: usize = MAGIC.len() + 1 + 4;
 
 /// Why bytes are not a valid control message.

@@ -104,6 +104,11 @@ impl Selector {
         &self.decisions.mixture
     }
 
+    /// The original mixture of the version of the potential in force.
+    pub fn original(&self) -> &Arc<Mixture> {
+        &self.decisions.regrader.original
+    }
+
     /// How near the alarm over a mixture that forgets its training data is: it is raised above 1.
     pub fn forgetting_level(&self) -> f64 {
         self.decisions.forgetting_state().level

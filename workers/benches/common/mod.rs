@@ -47,6 +47,7 @@ impl TimedWalk {
             model: model.clone(),
             threads: Threads::default(),
             settings: Arc::new(settings(threshold, ensemble)),
+            original: Arc::clone(mixture),
         };
         let mut assignment = assignment(seed_structure, ensemble, u64::MAX);
         // Any structure is a candidate from the first permitted step on.

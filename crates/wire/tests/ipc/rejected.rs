@@ -77,7 +77,7 @@ fn words(bytes: &[u8]) -> Vec<u64> {
 
 /// Plain data as a control message.
 fn sealed(content: &[u8]) -> Vec<u8> {
-    [b"CALM\x05".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat()
+    [b"CALM\x06".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat()
 }
 
 /// A request with a control message and the bytes after it.

@@ -37,7 +37,7 @@ fn content(message: &[u8]) -> &[u8] {
 
 /// Arbitrary content as a control message.
 fn encoded(content: &[u8]) -> Vec<u8> {
-    let control = [b"CALM\x05".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat();
+    let control = [b"CALM\x06".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat();
     frame::to_words(&control, None).as_bytes().to_vec()
 }
 
@@ -206,7 +206,7 @@ fn errors_are_specific() {
         }
     };
     assert_eq!(changed(8), ControlError::Magic(*b"BALM"));
-    assert_eq!(changed(12), ControlError::Version(4));
+    assert_eq!(changed(12), ControlError::Version(7));
     assert!(matches!(changed(13), ControlError::Checksum { .. }));
     assert!(matches!(changed(CONTENT), ControlError::Checksum { .. }));
     let short = |control: &[u8]| super::answer(frame::to_words(control, None).as_bytes());

@@ -150,11 +150,12 @@ fn trace_point() -> impl Strategy<Value = TracePoint> {
     let place = (any::<u64>(), any::<u32>(), any::<u64>());
     let (missing, number) = (|| option::of(-1e3..1e9), || -1e3..1e9);
     let state = (number(), number(), missing(), number(), option::of([(); 6].map(|()| 0.0..180.0)));
-    let bias = (missing(), missing(), number(), number(), number(), number());
+    let bias = (missing(), missing(), number(), number(), number(), number(), missing());
     (place, state, bias).prop_map(|(place, state, bias)| {
         let (number, segment, step) = place;
         let (time, temperature, pressure, relative_volume, cell) = state;
-        let (conserved_energy, gamma_max, bias_scale, cell_gain, bias_share, bias_work) = bias;
+        let (conserved_energy, gamma_max, bias_scale, cell_gain, bias_share, bias_work, gamma_max_original) =
+            bias;
         TracePoint {
             number,
             segment,
@@ -170,6 +171,7 @@ fn trace_point() -> impl Strategy<Value = TracePoint> {
             cell_gain,
             bias_share,
             bias_work,
+            gamma_max_original,
         }
     })
 }
