@@ -198,6 +198,8 @@ fn walk_settings() -> WalkSettings {
         cell_bias: CellBiasSettings::default(),
         remove_update_work: false,
         trace_interval: 50,
+        trajectory_interval: 0,
+        max_frames: 64,
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nmin_atoms = 3")
             .unwrap(),

@@ -212,7 +212,7 @@ fn walks_without_a_record_are_refused() {
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("walk 0 is not reproduced: "), "{said}");
     // The tables of version 19.
-    let sql = "DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
+    let sql = "DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
         UPDATE walk SET selector_state = replace(selector_state, '\"records\"', '\"before\"'), checksum = -1;
         DELETE FROM _sqlx_migrations WHERE version > 19; PRAGMA user_version = 19;";
     execute(here, sql);

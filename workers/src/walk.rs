@@ -11,6 +11,7 @@ mod start;
 mod state;
 mod step_view;
 mod trace;
+mod trajectory;
 mod update_work;
 
 use std::sync::Arc;
@@ -23,7 +24,7 @@ use potentials::{ModelWithFeatures, Wall, Zbl};
 use wire::messages::{
     Assignment, AssignmentReport, AssignmentStart, Outcome, Verdict, WalkEnd, WalkProgress,
 };
-use wire::{Candidate, Origin, TracePoint};
+use wire::{Candidate, Origin, TracePoint, WalkFrame};
 
 use crate::bias::{BiasedPotential, UngradedError};
 use crate::cell_bias::CellBias;
@@ -99,6 +100,7 @@ pub fn advance_observed(
         checkpoint: running.encode(),
         progress: running.progress(),
         trace: running.take_trace(),
+        frames: running.frames,
     })
 }
 
@@ -116,6 +118,7 @@ pub(crate) fn without_a_step(assignment: &Assignment, reason: String) -> Assignm
         checkpoint: assignment.checkpoint.clone().unwrap_or_default(),
         progress: WalkProgress::default(),
         trace: Vec::new(),
+        frames: Vec::new(),
     }
 }
 
@@ -137,6 +140,7 @@ struct RunningWalk<'a> {
     original: &'a Mixture,
     state: WalkState,
     trace: Vec<TracePoint>,
+    frames: Vec<WalkFrame>,
 }
 
 impl<'a> RunningWalk<'a> {
@@ -175,6 +179,7 @@ impl<'a> RunningWalk<'a> {
             original,
             state,
             trace: Vec::new(),
+            frames: Vec::new(),
         })
     }
 
@@ -216,6 +221,7 @@ impl<'a> RunningWalk<'a> {
             return Ok(interrupted);
         }
         if begins {
+            self.add_frame_if_due();
             on_step(&mut StepView { walk: self });
         }
         let last = self.settings.equilibration_steps + self.settings.biased_steps;
@@ -229,11 +235,12 @@ impl<'a> RunningWalk<'a> {
             if self.step() >= self.assignment.last_step {
                 return Ok(Outcome::StepsDone);
             }
-            if stopping() {
+            if stopping() || self.frames_are_full() {
                 return Ok(Outcome::Interrupted);
             }
             self.advance_one_step()?;
             self.trace_step()?;
+            self.add_frame_if_due();
             on_step(&mut StepView { walk: self });
             if let Some(outcome) = self.inspect_step()? {
                 return Ok(outcome);

@@ -10,5 +10,6 @@ mod constant_pressure;
 mod deep_models;
 mod labeller;
 mod trace;
+mod trajectory;
 mod update_work;
 mod walk;

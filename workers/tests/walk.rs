@@ -54,6 +54,8 @@ pub fn settings() -> WalkSettings {
         cell_bias: CellBiasSettings::default(),
         remove_update_work: false,
         trace_interval: 50,
+        trajectory_interval: 0,
+        max_frames: 64,
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'").unwrap(),
         min_interval: 200,

@@ -102,7 +102,16 @@ fn walk(door: &ConnectInfo) {
             let checkpoint = vec![0; CHECKPOINT];
             let progress = WalkProgress::default();
             let (walk, assignment, trace, start) = (WalkId(0), trip as u64, Vec::new(), None);
-            let report = AssignmentReport { walk, assignment, start, outcome, checkpoint, progress, trace };
+            let report = AssignmentReport {
+                walk,
+                assignment,
+                start,
+                outcome,
+                checkpoint,
+                progress,
+                trace,
+                frames: Vec::new(),
+            };
             let (begin, encoding) = (Instant::now(), walker.encoding());
             let work = walker.exchange(Some(report)).expect("an assignment");
             let (whole, encode) = (begin.elapsed(), walker.encoding() - encoding);

@@ -206,7 +206,7 @@ impl Selector {
         let WalkRecord { assignments: number, checkpoint, progress, .. } = walk.record.clone();
         let (checkpoint, outcome) =
             (checkpoint.unwrap_or_default(), Outcome::Ended(WalkEnd::Diverged { reason }));
-        let (start, trace) = (None, Vec::new());
+        let (start, trace, frames) = (None, Vec::new(), Vec::new());
         self.report(AssignmentReport {
             walk: id,
             assignment: number,
@@ -215,6 +215,7 @@ impl Selector {
             checkpoint,
             progress,
             trace,
+            frames,
         })
     }
 

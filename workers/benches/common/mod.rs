@@ -106,6 +106,8 @@ fn settings(threshold: f64, ensemble: Ensemble) -> WalkSettings {
         cell_bias,
         remove_update_work: false,
         trace_interval: 50,
+        trajectory_interval: 0,
+        max_frames: 64,
         skin: 0.5,
         collection: toml::from_str(&format!("rule = 'maximum_grade'\nthreshold = {threshold:e}"))
             .expect("a rule"),

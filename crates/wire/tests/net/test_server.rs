@@ -217,6 +217,7 @@ pub fn report(assignment: &Assignment) -> AssignmentReport {
         progress: WalkProgress::default(),
         start: None,
         trace: Vec::new(),
+        frames: Vec::new(),
     }
 }
 

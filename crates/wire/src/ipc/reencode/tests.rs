@@ -156,7 +156,7 @@ proptest! {
     fn reports_with_candidates_of_other_walks_are_rejected(sender in sender(), candidate in candidate()) {
         let walk = WalkId(candidate.id.walk.0 ^ 1);
         let (outcome, checkpoint) = (Outcome::Candidate(candidate), Vec::new());
-        let report = AssignmentReport { walk, assignment: 0, start: None, outcome, checkpoint, progress: WalkProgress::default(), trace: vec![] };
+        let report = AssignmentReport { walk, assignment: 0, start: None, outcome, checkpoint, progress: WalkProgress::default(), trace: vec![], frames: vec![] };
         prop_assert!(is_about_the_candidate(&super::request(&offered(sender, 1, Some(&report)))));
     }
 
@@ -244,6 +244,7 @@ fn excessive_lengths_are_rejected() {
         checkpoint,
         progress,
         trace: vec![],
+        frames: vec![],
     };
     let offer = offered(sender, 1, Some(&report));
     assert!(super::request(&offer).is_ok());
