@@ -1,5 +1,6 @@
 //! Runs a walk of a campaign again, from the record of its assignments. Changes nothing.
 
+mod end;
 mod parts;
 
 use std::cell::Cell;
@@ -74,7 +75,7 @@ pub async fn rerun(
     let context = WalkContext { model: model.shared(), threads, settings, original };
     let mixtures = MixtureStream::open(store, &artifact, begin.as_ref()).await?;
     let assignment = first_assignment(store, &record).await?;
-    Rerun { store, context, mixtures, assignment, on_step }.run(&parts, stopping).await
+    Rerun { store, record, context, mixtures, assignment, on_step }.run(&parts, stopping).await
 }
 
 /// Refuses an output that would replace a file of the campaign.
@@ -146,6 +147,7 @@ async fn first_assignment(store: &Store, record: &WalkRecord) -> Result<Assignme
 /// A walk that is run again.
 struct Rerun<'a, F> {
     store: &'a Store,
+    record: WalkRecord,
     context: WalkContext,
     mixtures: MixtureStream<'a>,
     /// The next part, once its record has been applied to it.
@@ -160,7 +162,7 @@ impl<F: FnMut(&mut StepView<'_, '_>)> Rerun<'_, F> {
         stopping: &impl Fn() -> bool,
     ) -> Result<RerunSummary, CommandError> {
         let mut summary = RerunSummary::default();
-        for part in parts {
+        for (number, part) in parts.iter().enumerate() {
             let mixture = self.mixtures.advance_to(part.start.mixture_version, |_| ()).await?;
             let expected = self.candidate_at_end_of(part).await?;
             let report = self.advance(part, expected.as_ref(), mixture, stopping)?;
@@ -173,6 +175,10 @@ impl<F: FnMut(&mut StepView<'_, '_>)> Rerun<'_, F> {
                 return Err(self.not_reproduced(&difference));
             }
             summary.candidates += u64::from(expected.is_some());
+            let is_last = number + 1 == parts.len();
+            if let Some(difference) = end::difference(&self.record, &report).filter(|_| is_last) {
+                return Err(self.not_reproduced(&difference));
+            }
             self.assignment.checkpoint = Some(report.checkpoint);
         }
         Ok(summary)

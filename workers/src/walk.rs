@@ -32,8 +32,8 @@ use crate::guard;
 use crate::settings::WalkSettings;
 use error::WalkError;
 use start::start;
-pub use state::has_known_layout;
 use state::{GoodState, WalkState};
+pub use state::{has_known_layout, is_same_state};
 pub use step_view::StepView;
 
 /// Data shared by every walk of a campaign.
