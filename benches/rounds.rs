@@ -100,13 +100,14 @@ struct RunningAssignment(Duration, u64, AssignmentReport);
 impl Campaign {
     fn run(settings: SelectorSettings, walkers: usize, seeds: Vec<SeedStructurePlan>) -> Self {
         let model = Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap());
+        let walks: usize = seeds.iter().map(|seed| seed.walks.len()).sum();
+        let mut selector = selector(settings, seeds, &model);
         let context = WalkContext {
             model: model.clone(),
             threads: Threads::default(),
             settings: Arc::new(walk_settings()),
+            original: Arc::clone(selector.original()),
         };
-        let walks: usize = seeds.iter().map(|seed| seed.walks.len()).sum();
-        let mut selector = selector(settings, seeds, &model);
         selector.start_walks();
         let (mut campaign, mut running, mut number) = (Self::default(), BinaryHeap::new(), 0);
         let (mut work, mut begun, mut has_control) = (Duration::ZERO, BTreeSet::new(), false);
@@ -198,6 +199,8 @@ fn walk_settings() -> WalkSettings {
         cell_bias: CellBiasSettings::default(),
         remove_update_work: false,
         trace_interval: 50,
+        trajectory_interval: 0,
+        max_frames: 64,
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nmin_atoms = 3")
             .unwrap(),

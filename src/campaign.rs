@@ -27,7 +27,7 @@ use orchestrator::selector::{CampaignMode, PotentialVersion, SelectorSettings, T
 use potentials::grace::Precision;
 use serde_json::{Value, json};
 use store::Protocol;
-use wire::{CampaignId, ContentHash, MAX_KEPT_POINTS};
+use wire::{CampaignId, ContentHash, MAX_KEPT_POINTS, WalkFrame};
 use workers::settings::{GuardSettings, WalkSettings};
 
 use crate::config::{Config, ConfigError, LabelMethod, Loaded, Warning, without_changeable};
@@ -197,14 +197,18 @@ impl LoadedCampaign {
     }
 
     /// Size of the largest message between walker and selector, bytes: a candidate of the largest seed structure with
-    /// the checkpoints of its walk (three states with velocities and forces) and the points of its trace.
+    /// the checkpoints of its walk (three states with velocities and forces), the points of its trace, and the frames of its trajectory.
     pub fn largest_message(&self) -> usize {
         let atoms = self.largest_seed_structure().map_or(0, Structure::len);
         let features = self.artifact.mixture.dimension();
         let interval = self.config.walk.trace_interval;
         let points = self.config.run.steps_per_assignment.get().checked_div(interval).unwrap_or(0);
         let points = points.min(MAX_KEPT_POINTS as u64) as usize + 2;
-        8 * atoms * (9 + features) + 512 * atoms + 192 * points + 16_384
+        let frames = match self.config.walk.trajectory_interval {
+            0 => 0,
+            _ => max_frames(&self.config) * WalkFrame::max_bytes(atoms),
+        };
+        8 * atoms * (9 + features) + 512 * atoms + 192 * points + frames + 16_384
     }
 
     /// The configuration with every default filled in, and with hashes instead of paths. A campaign that continues is
@@ -344,6 +348,17 @@ pub fn grader(model: &LoadedModel) -> Grader {
     Grader::new(model.elements().to_vec(), cutoffs)
 }
 
+/// Largest number of frames in a report.
+const MAX_FRAMES: u64 = 64;
+
+/// Largest number of frames in a report: those of an assignment without a roll back, up to a limit.
+fn max_frames(config: &Config) -> usize {
+    match config.run.steps_per_assignment.get().checked_div(config.walk.trajectory_interval) {
+        Some(frames) => frames.saturating_add(2).min(MAX_FRAMES) as usize,
+        None => 1,
+    }
+}
+
 /// The part of a configuration that walks need.
 pub fn walk_settings(config: &Config) -> WalkSettings {
     let Config { campaign, walk, collect, guard, .. } = config;
@@ -359,6 +374,8 @@ pub fn walk_settings(config: &Config) -> WalkSettings {
         reference_steps: walk.reference_steps,
         cell_bias: walk.cell_bias.unwrap_or_default().settings(),
         trace_interval: walk.trace_interval,
+        trajectory_interval: walk.trajectory_interval,
+        max_frames: max_frames(config),
         remove_update_work: walk.remove_update_work,
         skin: walk.skin.get(),
         collection: collect.criterion,

@@ -19,6 +19,10 @@ const CHECKPOINT_BYTES_PER_ATOM: u64 = 450;
 const POINT_BYTES: u64 = 152;
 /// The record of an assignment of a walk, bytes.
 const ASSIGNMENT_BYTES: u64 = 100;
+/// A frame of the trajectory of a walk, bytes per atom.
+const FRAME_BYTES_PER_ATOM: u64 = 12;
+/// More than any disk has.
+const LARGEST_BYTES: u64 = u64::MAX / 8;
 /// Largest size of SQLite's write-ahead log, bytes.
 pub const WAL_BYTES: u64 = 70_000_000;
 
@@ -35,8 +39,12 @@ pub fn estimate(campaign: &LoadedCampaign) -> DiskForecast {
     let copies = if config.campaign.control { 2 } else { 1 };
     let mean = seeds().map(|atoms| structure_bytes(atoms, features)).sum::<u64>() / number.max(1);
     let records = trace_bytes(config) + assignment_bytes(config);
-    let walk = |atoms| CHECKPOINT_BYTES_PER_ATOM * atoms + HALF_PAGE_BYTES + records;
-    let walks = seeds().zip(walks()).map(|(atoms, walks)| walks as u64 * walk(atoms)).sum::<u64>();
+    let walk = |atoms| {
+        CHECKPOINT_BYTES_PER_ATOM * atoms + HALF_PAGE_BYTES + records + trajectory_bytes(config, atoms)
+    };
+    let walks = seeds().zip(walks()).map(|(atoms, walks)| (walks as u64).saturating_mul(walk(atoms)));
+    // Sums of it do not overflow.
+    let walks = walks.fold(0, u64::saturating_add).min(LARGEST_BYTES);
     let mixture: usize =
         campaign.artifact.mixture.iter().map(|(.., component)| component.to_bytes().len()).sum();
     DiskForecast {
@@ -64,6 +72,14 @@ fn trace_bytes(config: &Config) -> u64 {
         }
         None => 0,
     }
+}
+
+/// The trajectory of a walk that makes all its steps.
+fn trajectory_bytes(config: &Config, atoms: u64) -> u64 {
+    let Some(frames) = steps(config).checked_div(config.walk.trajectory_interval) else { return 0 };
+    let parts = frames.min(steps(config) / config.run.steps_per_assignment.get()).saturating_add(1);
+    let frame = FRAME_BYTES_PER_ATOM * atoms + ASSIGNMENT_BYTES;
+    frames.saturating_add(1).saturating_mul(frame).saturating_add(parts.saturating_mul(HALF_PAGE_BYTES))
 }
 
 /// A structure with its candidate, features, grades and label.

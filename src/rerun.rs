@@ -1,11 +1,13 @@
 //! Runs a walk of a campaign again, from the record of its assignments. Changes nothing.
 
+mod end;
 mod parts;
 
 use std::cell::Cell;
 use std::path::Path;
 use std::sync::Arc;
 
+use atoms::Structure;
 use calm::Mixture;
 use orchestrator::selector::VERSION;
 use potentials::grace::Threads;
@@ -22,7 +24,7 @@ use crate::exit_status::CommandError;
 use crate::replay::{self, MixtureStream, RelocatedFilesArgs};
 use crate::runtime::cores;
 use crate::versions::VersionOnDisk;
-use parts::made_parts;
+pub use parts::made_parts;
 
 /// Last step of parts, which end where their records say.
 const NEVER: u64 = i64::MAX as u64;
@@ -61,20 +63,28 @@ pub async fn rerun(
     let begin = taken_up(store, record.conditions.version).await?;
     let config = configuration(store, begin.as_ref(), copies.path(), moved).await?;
     if let Some(output) = output {
-        let mut files = Vec::new();
-        texts(&replay::resolved(&store.campaign().await?)?, &mut files);
-        refuse_to_replace(output, files.iter().map(|file| (Path::new(file), "a file of the campaign")))?;
+        refuse_files_of_campaign(store, output).await?;
     }
     let (model, artifact, _) = campaign::load_for_grades(&config, Path::new("(the campaign)"))?;
     let mut settings = campaign::walk_settings(&config);
-    // These two may have changed since, but change no step.
-    settings.trace_interval = 0;
+    // These may have changed since, but change no step.
+    (settings.trace_interval, settings.trajectory_interval) = (0, 0);
     settings.guard.max_temperature = f64::INFINITY;
     let threads = Threads::new(cores() as usize).map_err(CommandError::failed)?;
-    let context = WalkContext { model: model.shared(), threads, settings: Arc::new(settings) };
+    let (settings, original) = (Arc::new(settings), Arc::new(artifact.mixture.clone()));
+    let context = WalkContext { model: model.shared(), threads, settings, original };
     let mixtures = MixtureStream::open(store, &artifact, begin.as_ref()).await?;
     let assignment = first_assignment(store, &record).await?;
-    Rerun { store, context, mixtures, assignment, on_step }.run(&parts, stopping).await
+    Rerun { store, record, context, mixtures, assignment, on_step }.run(&parts, stopping).await
+}
+
+/// Refuses an output that would replace a file of the campaign.
+pub async fn refuse_files_of_campaign(store: &Store, output: &Path) -> Result<(), CommandError> {
+    let config = replay::recorded_configuration(&store.campaign().await?)?;
+    let mut files = Vec::new();
+    texts(&serde_json::to_value(config).map_err(CommandError::failed)?, &mut files);
+    texts(&store.grade_files().await?, &mut files);
+    refuse_to_replace(output, files.iter().map(|file| (Path::new(file), "a file of the campaign")))
 }
 
 /// All texts in it, among them the names of files.
@@ -104,21 +114,27 @@ async fn configuration(
     Ok(config)
 }
 
-/// The walk before its first step.
-async fn first_assignment(store: &Store, record: &WalkRecord) -> Result<Assignment, CommandError> {
-    let seed_structure = store.seed_structure(record.seed_structure).await?.ok_or_else(|| {
+/// The structure where a walk starts.
+pub async fn seed_structure(store: &Store, record: &WalkRecord) -> Result<Structure, CommandError> {
+    let found = store.seed_structure(record.seed_structure).await?;
+    found.map(|seed| seed.structure).ok_or_else(|| {
         CommandError::Failed(format!(
             "the seed structure of walk {} is missing: the database is damaged; restore the campaign from a backup",
             record.walk
         ))
-    })?;
+    })
+}
+
+/// The walk before its first step.
+async fn first_assignment(store: &Store, record: &WalkRecord) -> Result<Assignment, CommandError> {
+    let seed_structure = seed_structure(store, record).await?;
     Ok(Assignment {
         campaign: store.campaign().await?.id,
         walk: record.walk,
         number: 0,
         origin: record.origin,
         random_walk: record.partner.unwrap_or(record.walk),
-        seed_structure: seed_structure.structure,
+        seed_structure,
         conditions: record.conditions.clone(),
         checkpoint: None,
         verdict: None,
@@ -131,6 +147,7 @@ async fn first_assignment(store: &Store, record: &WalkRecord) -> Result<Assignme
 /// A walk that is run again.
 struct Rerun<'a, F> {
     store: &'a Store,
+    record: WalkRecord,
     context: WalkContext,
     mixtures: MixtureStream<'a>,
     /// The next part, once its record has been applied to it.
@@ -145,7 +162,7 @@ impl<F: FnMut(&mut StepView<'_, '_>)> Rerun<'_, F> {
         stopping: &impl Fn() -> bool,
     ) -> Result<RerunSummary, CommandError> {
         let mut summary = RerunSummary::default();
-        for part in parts {
+        for (number, part) in parts.iter().enumerate() {
             let mixture = self.mixtures.advance_to(part.start.mixture_version, |_| ()).await?;
             let expected = self.candidate_at_end_of(part).await?;
             let report = self.advance(part, expected.as_ref(), mixture, stopping)?;
@@ -158,6 +175,10 @@ impl<F: FnMut(&mut StepView<'_, '_>)> Rerun<'_, F> {
                 return Err(self.not_reproduced(&difference));
             }
             summary.candidates += u64::from(expected.is_some());
+            let is_last = number + 1 == parts.len();
+            if let Some(difference) = end::difference(&self.record, &report).filter(|_| is_last) {
+                return Err(self.not_reproduced(&difference));
+            }
             self.assignment.checkpoint = Some(report.checkpoint);
         }
         Ok(summary)
@@ -240,8 +261,8 @@ fn shown(at: &PathPosition) -> String {
     }
 }
 
-/// The walk with its conditions.
-async fn find_walk(store: &Store, walk: WalkId) -> Result<WalkRecord, CommandError> {
+/// The record of a walk.
+pub async fn find_walk(store: &Store, walk: WalkId) -> Result<WalkRecord, CommandError> {
     if let Some(found) = store.load_walk(walk).await? {
         return Ok(found);
     }

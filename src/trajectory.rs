@@ -13,7 +13,7 @@ use flate2::write::GzEncoder;
 
 use crate::atomic_file::{cannot_create, cannot_write};
 use crate::exit_status::CommandError;
-pub use frame::TrajectoryStep;
+pub use frame::{StepMotion, TrajectoryStep};
 
 /// Level of zstd: about as fast as the dynamics of small cells.
 const ZSTD_LEVEL: i32 = 3;

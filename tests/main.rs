@@ -58,6 +58,7 @@ mod scheduling;
 mod schema;
 mod select;
 mod status;
+mod trajectories;
 mod triage;
 mod unlabelled_updates;
 mod unlikely_labels;

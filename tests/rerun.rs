@@ -211,8 +211,29 @@ fn walks_without_a_record_are_refused() {
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("walk 0 is not reproduced: "), "{said}");
+    // Another end than the record says.
+    for (change, said) in [
+        ("gamma_max = gamma_max + 1.0", "γ_max of the last step differs"),
+        ("rejected = rejected + 1", "the number of rejections differs"),
+        (
+            "checkpoint = (SELECT checkpoint FROM walk AS other WHERE other.walk = 2), checkpoint_checksum = -1",
+            "the last checkpoint differs",
+        ),
+    ] {
+        execute(here, "DROP TABLE IF EXISTS kept; CREATE TABLE kept AS SELECT * FROM walk");
+        execute(here, &format!("UPDATE walk SET {change}, checksum = -1 WHERE walk = 1"));
+        let output = calmwalk(here, ["rerun", "here", "1"]);
+        assert_eq!(output.status.code(), Some(1));
+        assert!(
+            stderr(&output).contains(&format!("walk 1 is not reproduced: {said}")),
+            "{}",
+            stderr(&output)
+        );
+        execute(here, "DELETE FROM walk; INSERT INTO walk SELECT * FROM kept; DROP TABLE kept");
+    }
+    succeed(here, ["rerun", "here", "1"]);
     // The tables of version 19.
-    let sql = "DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
+    let sql = "DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
         UPDATE walk SET selector_state = replace(selector_state, '\"records\"', '\"before\"'), checksum = -1;
         DELETE FROM _sqlx_migrations WHERE version > 19; PRAGMA user_version = 19;";
     execute(here, sql);

@@ -56,7 +56,9 @@ fn check_points(walk: &Value, titles: &[String], rows: &[Vec<Option<f64>>]) {
         assert!((lengths / first - volume).abs() < 1e-9 && of("alpha") == Some(90.0), "{row:?}");
         assert!(of("temperature").unwrap() > 100.0 && of("pressure").unwrap().abs() < 100.0, "{row:?}");
         assert_eq!(of("conserved_energy"), None, "there is none with a Langevin thermostat");
-        assert!(of("gamma_max").unwrap() > 0.0);
+        assert!(of("gamma_max").unwrap() > 0.0 && of("gamma_max_original").unwrap() > 0.0);
+        let is_first = number == 0 && walk["walk"] == 0;
+        assert!(!is_first || of("gamma_max") == of("gamma_max_original"), "{row:?}");
         let acts = is_biased && step > 30.0;
         assert_eq!((of("bias_scale") > Some(0.0), of("bias_share") > Some(0.0)), (acts, acts), "{row:?}");
         // τ is 0.3 on average over the steps, not at each of them.
@@ -133,12 +135,36 @@ fn check_explanations(here: &Path, address: &str) {
     }
 }
 
+/// The selector grades candidates with mixtures of its own.
+#[test]
+fn the_points_at_candidates_have_their_grades() {
+    let directory = campaign(&[("tau = 0.3\n", "tau = 0.3\ntrace_interval = 1\n")]);
+    let here = directory.path();
+    let listed = succeed(here, ["export", "here", "--control", "--output", "all.extxyz"]);
+    let frames = atoms::read_extxyz(&here.join("all.extxyz")).unwrap();
+    assert!(frames.len() > 4, "{listed}");
+    let mut updated = 0;
+    for frame in frames {
+        let id = frame.info["candidate_id"].text().unwrap();
+        let details: Value = serde_json::from_str(&succeed(here, ["explain", "here", id, "--json"])).unwrap();
+        let point = &details["found"]["trace_point"];
+        assert_eq!(point["step"], details["found"]["step"]);
+        updated += u32::from(point["gamma_max"] != point["gamma_max_original"]);
+        for (key, mixture) in [("gamma_max_original", "original"), ("gamma_max", "walker")] {
+            let numbers = [&point[key], &details["grades"][mixture]["gamma_max"]];
+            let [found, expected] = numbers.map(|number| number.as_f64().unwrap());
+            assert!((found / expected - 1.0).abs() < 1e-9, "{key} of {id}: {found}, not {expected}");
+        }
+    }
+    assert!(updated > 0, "no candidate after an update");
+}
+
 #[test]
 fn a_campaign_without_an_interval_has_no_traces() {
     let directory = campaign(&[("tau = 0.3\n", "tau = 0.3\ntrace_interval = 0\n")]);
     let here = directory.path();
     let (titles, rows) = csv(here, 0);
-    assert_eq!((titles.len(), rows.len()), (19, 0));
+    assert_eq!((titles.len(), rows.len()), (20, 0));
     succeed(here, ["report", "here", "--output", "report"]);
     assert!(!here.join("report/figures/walks.csv").exists());
 }

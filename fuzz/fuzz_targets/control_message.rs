@@ -20,7 +20,7 @@ fn read(bytes: &[u8]) {
 
 /// Prepends a valid header, so that the fuzzer reaches the code after the checksum.
 fn framed(bytes: &[u8]) -> Vec<u8> {
-    let control = [b"CALM\x05".as_slice(), &crc32fast::hash(bytes).to_le_bytes(), bytes].concat();
+    let control = [b"CALM\x06".as_slice(), &crc32fast::hash(bytes).to_le_bytes(), bytes].concat();
     let mut framed = [(control.len() as u64).to_le_bytes().as_slice(), &control].concat();
     framed.resize(framed.len().next_multiple_of(8), 0);
     framed

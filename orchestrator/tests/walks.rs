@@ -5,7 +5,7 @@ use orchestrator::selector::{
 };
 use store::records::{AssignmentRecord, ComponentRecord, Fate};
 use wire::messages::{Assignment, AssignmentReport, AssignmentStart, Outcome, WalkEnd, WalkProgress};
-use wire::{Origin, TracePoint, WalkId};
+use wire::{Origin, TracePoint, WalkFrame, WalkId};
 
 use crate::common;
 use crate::common::memory::MemoryStore;
@@ -208,7 +208,9 @@ fn the_points_of_every_report_are_committed_with_it() {
 /// What walkers began assignments with, and where these ended: with every report, in both modes.
 #[test]
 fn assignments_are_recorded_with_their_reports() {
+    let frame = |step| WalkFrame { step, ..WalkFrame::default() };
     let from = |assignment: &Assignment, outcome, steps: [u64; 2], mixture_version| AssignmentReport {
+        frames: vec![frame(steps[0]), frame(steps[1])],
         start: Some(AssignmentStart {
             position: at(steps[0]).position(),
             mixture_version,
@@ -222,6 +224,11 @@ fn assignments_are_recorded_with_their_reports() {
             let [begin, end] = [one.start.position.step, one.end.step];
             [one.part, one.number, one.start.mixture_version, begin, end]
         };
+        // Each record has the frames of its steps.
+        let parts = commit.trajectories.iter().map(|part| (part.part, part.frames.clone()));
+        let frames = |one: &AssignmentRecord| vec![frame(one.start.position.step), frame(one.end.step)];
+        let expected = commit.assignments.iter().map(|one| (one.part, frames(one)));
+        assert_eq!(parts.collect::<Vec<_>>(), expected.collect::<Vec<_>>());
         commit.assignments.iter().map(row).collect()
     };
     for mode in [CampaignMode::Live, CampaignMode::Reproducible] {
@@ -268,9 +275,14 @@ fn assignments_of_walks_of_earlier_versions_are_not_recorded() {
         threshold_factor: 1.0,
         verdict: None,
     };
-    let report =
-        AssignmentReport { start: Some(start), ..common::report(&assignment, Outcome::StepsDone, at(10)) };
-    assert!(decided(&mut selector, report).assignments.is_empty());
+    let frames = vec![WalkFrame::default()];
+    let report = AssignmentReport {
+        start: Some(start),
+        frames,
+        ..common::report(&assignment, Outcome::StepsDone, at(10))
+    };
+    let commit = decided(&mut selector, report);
+    assert!(commit.assignments.is_empty() && commit.trajectories.is_empty());
 }
 
 fn returned(segment: u32, step: u64) -> WalkProgress {

@@ -28,7 +28,10 @@ QUANTITIES = (
     "cell_gain",
     "bias_share",
     "bias_work",
+    "gamma_max_original",
 )
+# Traces of the first version end before this one, and have NaN for it.
+FIRST_QUANTITIES = QUANTITIES.index("gamma_max_original")
 
 Trace = dict[str, NDArray[np.float64] | NDArray[np.int64]]
 
@@ -41,11 +44,13 @@ def empty_trace() -> Trace:
 def decode_trace(walk: int, points: int, data: bytes) -> Trace:
     """The columns of a trace with so many points. Later versions of calmwalk add quantities at the end."""
     numbers = decode_numbers(data)
-    if points < 1 or len(numbers) < points * len(QUANTITIES) or len(numbers) % points:
+    if points < 1 or len(numbers) < points * FIRST_QUANTITIES or len(numbers) % points:
         raise DamagedError(
             f"damaged database: the trace of walk {walk}: {len(numbers)} numbers for {points} points"
         )
-    return _columns(numbers.reshape(-1, points))
+    rows = numbers.reshape(-1, points)
+    missing = np.full((max(len(QUANTITIES) - len(rows), 0), points), np.nan)
+    return _columns(np.concatenate([rows, missing]))
 
 
 def _columns(rows: NDArray[np.float64]) -> Trace:

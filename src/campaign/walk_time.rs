@@ -57,8 +57,10 @@ impl StepTimes {
         let mut settings = campaign.walk_settings();
         // Only the bias of the walk differs from that of its control walk, and the volume is that of the seed structure.
         (settings.equilibration_steps, settings.biased_steps) = (0, u64::MAX);
-        let context = WalkContext { model: campaign.model.shared(), threads, settings: Arc::new(settings) };
+        settings.trajectory_interval = 0;
         let mixture = Arc::new(campaign.artifact.mixture.clone());
+        let (model, settings, original) = (campaign.model.shared(), Arc::new(settings), Arc::clone(&mixture));
+        let context = WalkContext { model, threads, settings, original };
         let mut sizes: BTreeMap<u32, Vec<&SourcedStructure>> = BTreeMap::new();
         for seed in &campaign.seed_structures {
             sizes.entry(class(seed)).or_default().push(seed);

@@ -14,7 +14,7 @@ use crate::output::{Bar, count, print};
 use crate::replay::RelocatedFilesArgs;
 use crate::rerun::{RerunSummary, rerun};
 use crate::signals;
-use crate::trajectory::{Trajectory, TrajectoryStep, check_name};
+use crate::trajectory::{StepMotion, Trajectory, TrajectoryStep, check_name};
 
 const BAR: &str = "{spinner} {msg}";
 
@@ -127,9 +127,11 @@ impl FrameOutput {
         view.separate().map_err(CommandError::failed)?;
         trajectory.push(&TrajectoryStep {
             structure: view.structure(),
-            velocities: view.velocities(),
-            masses: view.masses(),
-            evaluation: view.physical(),
+            motion: Some(StepMotion {
+                velocities: view.velocities(),
+                masses: view.masses(),
+                evaluation: view.physical(),
+            }),
             segment: Some(position.segment),
             step: position.step,
             time: view.time(),

@@ -27,9 +27,10 @@ impl WalkerArgs {
         let stopping = signals::stop_token()?;
         let threads = Threads::new(setup.threads).map_err(CommandError::failed)?;
         let model = setup.model.load(setup.device.as_ref(), &stopping)?;
-        let context = WalkContext { model, threads, settings: Arc::new(setup.settings) };
         let mut transport =
             IpcWalker::connect(&setup.connect_info, stopping).map_err(CommandError::failed)?;
+        let original = Arc::clone(transport.original());
+        let context = WalkContext { model, threads, settings: Arc::new(setup.settings), original };
         let ended = walker::run(&context, &mut transport);
         match (ended, transport.failure()) {
             (_, Some(failure)) => Err(CommandError::failed(failure)),

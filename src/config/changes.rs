@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may change when a campaign is resumed; all others keep their first values.
-pub(super) const CHANGEABLE: [&str; 93] = [
+pub(super) const CHANGEABLE: [&str; 94] = [
     "campaign.control_share",
     "potential.python.environment",
     "potential.python.launcher",
@@ -17,6 +17,7 @@ pub(super) const CHANGEABLE: [&str; 93] = [
     "potential.python.cache",
     "seed_structures",
     "walk.trace_interval",
+    "walk.trajectory_interval",
     "collect.max_per_walk",
     "collect.max_per_seed_structure",
     "collect.max_structures",

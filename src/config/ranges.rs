@@ -70,7 +70,7 @@ const fn range(
 }
 
 /// All ranges, by table.
-pub static RANGES: [Range; 132] = [
+pub static RANGES: [Range; 133] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -96,6 +96,7 @@ pub static RANGES: [Range; 132] = [
     range("walk.bias_averaging_steps", "", [0.0, STEPS], [1.0, 1e3], ""),
     range("walk.bias_norm_interval", "", [0.0, STEPS], [1.0, 100.0], ""),
     range("walk.trace_interval", "", [0.0, STEPS], [0.0, 1e5], ""),
+    range("walk.trajectory_interval", "", [0.0, STEPS], [0.0, 1e5], ""),
     range("walk.skin", "Å", [0.0, 10.0], [0.05, 3.0], ""),
     range("calm.max_mean_square_growth", "", [1.0, 1e6], [1.5, 100.0], ""),
     range("seed_structures.min_atoms", "", [0.0, 1e5], [2.0, 1e3], ""),

@@ -60,6 +60,9 @@ pub struct WalkSection {
     /// Number of steps between two points of the trace, which shows temperature, pressure, grade and bias along a walk. 0: none.
     #[serde(default = "defaults::trace_interval")]
     pub trace_interval: u64,
+    /// Number of steps between two frames of the trajectory of a walk that the store keeps. 0: none.
+    #[serde(default)]
+    pub trajectory_interval: u64,
     /// Skin of the neighbour list, Å.
     #[serde(default = "defaults::skin")]
     pub skin: Positive,

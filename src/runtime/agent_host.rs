@@ -6,7 +6,6 @@ use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
 use bridge::Device;
-use calm::Mixture;
 use futures_util::FutureExt;
 use orchestrator::launcher::{self, Children};
 use orchestrator::supervisor::{ChildState, Limits};
@@ -23,7 +22,7 @@ use workers::agent::{self, Agent, OrchestratorEvent};
 use super::agent_model::{self, HostPython};
 use super::device_watch::{self, DeviceWatch};
 use super::process_manager::all_failed_message;
-use super::walker_host::{HostMemory, HostSizes, walker_launcher};
+use super::walker_host::{HostMemory, HostMixtures, HostSizes, walker_launcher};
 use super::{CHANNEL, STOP_MESSAGE};
 use crate::exit_status::{CommandError, ExitStatus};
 use crate::output::{count, log_and_print, log_and_warn};
@@ -111,7 +110,7 @@ async fn run_version(
         }
     };
     let shm_dir = ShmDir::for_campaign(directory).map_err(CommandError::failed)?;
-    let mixture = joined.newest().await;
+    let (mixture, original) = (joined.newest().await, Arc::clone(&joined.original));
     // The walkers end with a device, too.
     let (host_stop, asked) = (stop.child_token(), stop.clone());
     let _watch = DeviceWatch::start(&devices, None, &host_stop, "assignments go back to the orchestrator");
@@ -127,7 +126,7 @@ async fn run_version(
         }))
     };
     let host = HostPlan { setup: &setup, walkers, threads, devices: &devices, stop: &host_stop, state };
-    let ended = host.run_in(&shm_dir, &mixture, dispatch).await;
+    let ended = host.run_in(&shm_dir, HostMixtures { newest: &mixture, original: &original }, dispatch).await;
     let removed = shm_dir.remove().map_err(CommandError::failed);
     let ended = ended?;
     removed?;
@@ -225,13 +224,13 @@ impl HostPlan<'_> {
     async fn run_in(
         self,
         shm_dir: &ShmDir,
-        mixture: &Mixture,
+        mixtures: HostMixtures<'_>,
         dispatch: impl FnOnce(mpsc::Receiver<Incoming>) -> DispatchTask,
     ) -> Result<HostEnd, CommandError> {
         let Self { setup, walkers, threads, devices, stop, state } = self;
         let sizes = HostSizes { walkers, message_bytes: setup.message_bytes, devices: devices.len() };
         let session = u64::from(std::process::id());
-        let memory = HostMemory::open(shm_dir, sizes, mixture, session, devices)?;
+        let memory = HostMemory::open(shm_dir, sizes, mixtures, session, devices)?;
         let (model, addresses) = (setup.model.for_walkers(), memory.addresses());
         let HostMemory { prepared: _prepared, mixture: shared, server, calls: _calls } = memory;
         let line = server.handle();

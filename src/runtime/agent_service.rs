@@ -13,6 +13,7 @@ use wire::transport::Incoming;
 use workers::labeller::HEARTBEAT_INTERVAL;
 
 use super::RunContext;
+use super::walker_host::HostMixtures;
 use crate::exit_status::CommandError;
 use crate::output::{count, log_and_print, log_and_warn};
 use crate::process_config;
@@ -22,6 +23,7 @@ pub struct AgentService {
     server: Option<AgentServer>,
     store: Store,
     mixture: Arc<Mixture>,
+    original: Arc<Mixture>,
 }
 
 impl AgentService {
@@ -29,12 +31,12 @@ impl AgentService {
     pub async fn open(
         run: RunContext<'_>,
         session: u64,
-        mixture: &Arc<Mixture>,
+        HostMixtures { newest, original }: HostMixtures<'_>,
     ) -> Result<Self, CommandError> {
         // Writes wait here while the database is unreachable.
-        let (store, mixture) =
-            (run.store.clone().with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT), Arc::clone(mixture));
-        let Some(listen) = run.listen else { return Ok(Self { server: None, store, mixture }) };
+        let store = run.store.clone().with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT);
+        let (mixture, original) = (Arc::clone(newest), Arc::clone(original));
+        let Some(listen) = run.listen else { return Ok(Self { server: None, store, mixture, original }) };
         let setup = run.campaign.agent_config()?;
         let files =
             setup.model.files().into_iter().map(|file| (file.hash.clone(), file.path.clone())).collect();
@@ -49,7 +51,7 @@ impl AgentService {
         })?;
         listen.announce(server.endpoint())?;
         log_and_print(format_args!("agents may join at {}", server.endpoint()));
-        Ok(Self { server: Some(server), store, mixture })
+        Ok(Self { server: Some(server), store, mixture, original })
     }
 
     /// Serves agents until there is no more work and the last agent has left.
@@ -58,7 +60,7 @@ impl AgentService {
         let (sender, events) = mpsc::unbounded_channel();
         let on_event = move |event| drop(sender.send(event));
         let (ended, ()) = tokio::join!(
-            server.run(self.mixture, stop, to_reactor, on_event),
+            server.run(self.mixture, self.original, stop, to_reactor, on_event),
             record_events(&self.store, events)
         );
         ended.map_err(CommandError::failed)

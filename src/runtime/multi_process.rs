@@ -23,7 +23,7 @@ use super::agent_service::AgentService;
 use super::device_watch::{self, DeviceWatch, LABELS_GO_ON};
 use super::label_order::CompletionModels;
 use super::process_manager::{self, ProcessManager};
-use super::walker_host::{HostMemory, HostSizes, walker_launcher};
+use super::walker_host::{HostMemory, HostMixtures, HostSizes, walker_launcher};
 use super::{CHANNEL, ReactorTask, RunContext, spawn, start_reactor, wanted_walkers};
 use crate::campaign::LoadedCampaign;
 use crate::exit_status::CommandError;
@@ -70,8 +70,10 @@ async fn run_in(
     completion: CompletionModels,
 ) -> Result<reactor::RunOutcome, CommandError> {
     let RunContext { campaign, store, process, .. } = run;
-    let (mixture, devices) = (Arc::clone(selector.mixture()), campaign.model.devices());
-    let memory = HostMemory::open(place, host_sizes(campaign), &mixture, session(process), devices)?;
+    let (mixture, original) = (Arc::clone(selector.mixture()), Arc::clone(selector.original()));
+    let (devices, mixtures) =
+        (campaign.model.devices(), HostMixtures { newest: &mixture, original: &original });
+    let memory = HostMemory::open(place, host_sizes(campaign), mixtures, session(process), devices)?;
     let (model, addresses) = (campaign.walker_model()?, memory.addresses());
     let HostMemory { prepared: _prepared, mixture: shared, server, calls: _calls } = memory;
     // The manager cancels it too, when the run cannot continue.
@@ -95,7 +97,7 @@ async fn run_in(
 
     let (to_reactor, incoming) = mpsc::channel(CHANNEL);
     let local = server.run(shared, to_reactor.clone(), manager.listener());
-    let agents = AgentService::open(run, session(process), &mixture).await?;
+    let agents = AgentService::open(run, session(process), mixtures).await?;
     let no_more_work = CancellationToken::new();
     let walks = stopping.child_token();
     // Agents stop too when walks cannot continue here: with a later run, they join again.

@@ -4,6 +4,7 @@ use std::convert::Infallible;
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 
+use calm::Mixture;
 use orchestrator::reactor;
 use orchestrator::selector::Selector;
 use potentials::grace::Threads;
@@ -80,7 +81,7 @@ impl Tasks {
         let stopping = run.stop.child_token();
         let closing = Arc::new(Shutdown::new(run.stop.child_token()));
         let (to_reactor, incoming) = mpsc::channel(CHANNEL);
-        let walkers = start_walkers(run.campaign, &to_reactor, &stopping)?;
+        let walkers = start_walkers(run.campaign, selector.original(), &to_reactor, &stopping)?;
         let labellers = start_labellers(run, &closing)?;
         let reactor = start_reactor(run, selector, incoming, stopping.clone(), completion);
         let external_labels = labellers.is_empty().then(|| run.store.clone());
@@ -149,6 +150,7 @@ fn failure_of(labeller: Result<Result<(), StoreError>, JoinError>) -> Option<Com
 
 fn start_walkers(
     campaign: &LoadedCampaign,
+    original: &Arc<Mixture>,
     to_reactor: &mpsc::Sender<Incoming>,
     stopping: &CancellationToken,
 ) -> Result<Vec<JoinHandle<walker::WalkerExit>>, CommandError> {
@@ -157,7 +159,8 @@ fn start_walkers(
         let mut transport = InProcess::new(number, to_reactor.clone(), stopping.clone());
         let threads =
             Threads::new(campaign.config.run.threads_per_walker.get()).map_err(CommandError::failed)?;
-        let context = WalkContext { model: Arc::clone(&model), threads, settings: Arc::clone(&settings) };
+        let (model, settings, original) = (Arc::clone(&model), Arc::clone(&settings), Arc::clone(original));
+        let context = WalkContext { model, threads, settings, original };
         thread::Builder::new()
             .name(format!("walker-{number}"))
             .spawn(move || walker::run(&context, &mut transport))

@@ -26,9 +26,18 @@ pub struct HostSizes {
     pub devices: usize,
 }
 
+/// The mixtures that walkers grade with.
+#[derive(Clone, Copy)]
+pub struct HostMixtures<'a> {
+    /// The newest version.
+    pub newest: &'a Arc<Mixture>,
+    /// The original one.
+    pub original: &'a Arc<Mixture>,
+}
+
 /// The open shared memory of a host.
 pub struct HostMemory {
-    /// The mixture, for its walkers.
+    /// The mixtures, for its walkers.
     pub mixture: SharedMixture,
     /// Their messages.
     pub server: IpcServer,
@@ -71,13 +80,14 @@ impl HostMemory {
     pub fn open(
         place: &ShmDir,
         sizes: HostSizes,
-        mixture: &Mixture,
+        HostMixtures { newest, original }: HostMixtures<'_>,
         session: u64,
         devices: &[Arc<Device>],
     ) -> Result<Self, CommandError> {
-        let prepared = place.prepare(sizes.space_needed(mixture)?).map_err(CommandError::failed)?;
-        let mixture = SharedMixture::create(&place.mixture(), mixture, sizes.walkers);
-        let mixture = mixture.map_err(CommandError::failed)?;
+        let prepared = place.prepare(sizes.space_needed(newest)?).map_err(CommandError::failed)?;
+        let mixture = SharedMixture::create(&place.mixture(), newest, sizes.walkers);
+        let mut mixture = mixture.map_err(CommandError::failed)?;
+        mixture.publish_original(original).map_err(CommandError::failed)?;
         let server = IpcServer::open(place, sizes.messages(), session).map_err(CommandError::failed)?;
         let calls = devices.iter().zip(session..).map(|(device, session)| {
             DeviceService::open(device, place, session, sizes.callers(), sizes.call_words())

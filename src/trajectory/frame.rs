@@ -1,7 +1,7 @@
 //! A step of a trajectory, as a frame of either format.
 
 use atoms::extxyz::{Column, Frame, FrameLabels, LabelKeys};
-use atoms::lammps_dump::DumpSnapshot;
+use atoms::lammps_dump::{DumpMotion, DumpSnapshot};
 use atoms::units::ACCELERATION;
 use atoms::{Evaluation, Structure, Vec3};
 use md::Dynamics;
@@ -9,12 +9,8 @@ use md::Dynamics;
 /// What a frame shows of a step.
 pub struct TrajectoryStep<'a> {
     pub structure: &'a Structure,
-    /// Å/fs.
-    pub velocities: &'a [Vec3],
-    /// u.
-    pub masses: &'a [f64],
-    /// Of the potential.
-    pub evaluation: &'a Evaluation,
+    /// What the trajectories of the store do not have.
+    pub motion: Option<StepMotion<'a>>,
     /// Segment of a walk.
     pub segment: Option<u32>,
     pub step: u64,
@@ -26,15 +22,27 @@ pub struct TrajectoryStep<'a> {
     pub gamma: Option<&'a [f64]>,
 }
 
+/// How the atoms move, and why.
+pub struct StepMotion<'a> {
+    /// Å/fs.
+    pub velocities: &'a [Vec3],
+    /// u.
+    pub masses: &'a [f64],
+    /// Of the potential.
+    pub evaluation: &'a Evaluation,
+}
+
 impl<'a> TrajectoryStep<'a> {
     /// The present step of a run.
     pub fn of_run(dynamics: &'a Dynamics) -> Self {
         let state = dynamics.state();
         Self {
             structure: &state.structure,
-            velocities: &state.velocities,
-            masses: dynamics.masses(),
-            evaluation: dynamics.evaluation(),
+            motion: Some(StepMotion {
+                velocities: &state.velocities,
+                masses: dynamics.masses(),
+                evaluation: dynamics.evaluation(),
+            }),
             segment: None,
             step: state.step,
             time: state.step as f64 * dynamics.checkpoint().time_step,
@@ -43,22 +51,13 @@ impl<'a> TrajectoryStep<'a> {
         }
     }
 
-    /// Energy (eV), forces (eV/Å), stress (eV/Å³, without its kinetic part), step, time (fs), temperature (K) and momenta.
+    /// Step, time (fs) and temperature (K), and, if the motion is known, energy (eV), forces (eV/Å), stress (eV/Å³, without its kinetic
+    /// part) and momenta.
     pub(super) fn frame(&self) -> Frame {
-        let Self { structure, evaluation, .. } = *self;
-        let labels = FrameLabels {
-            energy: Some(evaluation.energy()),
-            forces: Some(evaluation.forces.clone()),
-            stress: evaluation.stress(structure),
-        };
-        // The unit of momentum of ASE is u Å per Å √(u/eV); 1 fs is √ACCELERATION of this unit of time, with the acceleration of 1
-        // u by 1 eV/Å.
-        let unit = ACCELERATION.sqrt();
-        let momenta = self.velocities.iter().zip(self.masses);
-        let momenta: Vec<_> = momenta.map(|(v, mass)| v.map(|v| mass * v / unit)).collect();
-        let mut frame = Frame::from(structure.clone());
-        frame.set_labels(&labels, LabelKeys::Ase);
-        frame.arrays.insert("momenta".into(), Column::vectors(&momenta));
+        let mut frame = Frame::from(self.structure.clone());
+        if let Some(motion) = &self.motion {
+            motion.add_to(&mut frame, self.structure);
+        }
         if let Some(gamma) = self.gamma {
             frame.arrays.insert("gamma".into(), Column::scalars(gamma));
         }
@@ -76,9 +75,29 @@ impl<'a> TrajectoryStep<'a> {
             structure: self.structure,
             timestep: self.step,
             time: self.time,
-            velocities: self.velocities,
-            forces: &self.evaluation.forces,
+            motion: self.motion.as_ref().map(|StepMotion { velocities, evaluation, .. }| DumpMotion {
+                velocities,
+                forces: &evaluation.forces,
+            }),
             scalars: self.gamma.map(|gamma| ("c_gamma", gamma)).into_iter().collect(),
         }
+    }
+}
+
+impl StepMotion<'_> {
+    /// Adds energy, forces, stress and momenta.
+    fn add_to(&self, frame: &mut Frame, structure: &Structure) {
+        let labels = FrameLabels {
+            energy: Some(self.evaluation.energy()),
+            forces: Some(self.evaluation.forces.clone()),
+            stress: self.evaluation.stress(structure),
+        };
+        // The unit of momentum of ASE is u Å per Å √(u/eV); 1 fs is √ACCELERATION of this unit of time, with the acceleration of 1
+        // u by 1 eV/Å.
+        let unit = ACCELERATION.sqrt();
+        let momenta = self.velocities.iter().zip(self.masses);
+        let momenta: Vec<_> = momenta.map(|(v, mass)| v.map(|v| mass * v / unit)).collect();
+        frame.set_labels(&labels, LabelKeys::Ase);
+        frame.arrays.insert("momenta".into(), Column::vectors(&momenta));
     }
 }

@@ -12,7 +12,7 @@ fn structure(cell: [[f64; 3]; 3], periodic: [bool; 3]) -> Structure {
 }
 
 /// The frames of a file with two steps of a structure.
-fn written_and_read(name: &str, structure: &Structure) -> Vec<Structure> {
+fn written_and_read(name: &str, structure: &Structure, has_motion: bool) -> Vec<Structure> {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join(name);
     let evaluation = Evaluation {
@@ -25,9 +25,11 @@ fn written_and_read(name: &str, structure: &Structure) -> Vec<Structure> {
         trajectory
             .push(&TrajectoryStep {
                 structure,
-                velocities: &[[0.001, -0.002, 0.0]; 3],
-                masses: &[58.7, 27.0, 58.7],
-                evaluation: &evaluation,
+                motion: has_motion.then_some(StepMotion {
+                    velocities: &[[0.001, -0.002, 0.0]; 3],
+                    masses: &[58.7, 27.0, 58.7],
+                    evaluation: &evaluation,
+                }),
                 segment: Some(1),
                 step,
                 time: 2.0 * step as f64,
@@ -50,7 +52,10 @@ fn every_format_has_the_bits_of_the_structure() {
         for name in
             ["a.extxyz", "a.XYZ", "a.xyz.gz", "a.extxyz.zst", "a.dump", "a.lammpstrj.gz", "a.dump.zst"]
         {
-            assert_eq!(written_and_read(name, &structure), [structure.clone(), structure.clone()], "{name}");
+            for has_motion in [true, false] {
+                let found = written_and_read(name, &structure, has_motion);
+                assert_eq!(found, [structure.clone(), structure.clone()], "{name}");
+            }
         }
     }
 }
@@ -60,7 +65,7 @@ fn a_dump_of_a_slab_or_cluster_has_a_box_around_it() {
     let slab = structure([[4.0, 0.0, 0.0], [0.0, 5.0, 0.0], [0.0; 3]], [true, true, false]);
     let cluster = structure([[0.0; 3]; 3], [false; 3]);
     for (structure, size) in [(slab, [4.0, 5.0, 4.1 - 1.0 / 3.0]), (cluster, [2.8, 2.45, 4.1 - 1.0 / 3.0])] {
-        for found in written_and_read("a.dump", &structure) {
+        for found in written_and_read("a.dump", &structure, true) {
             assert_eq!((found.periodic, &found.species), (structure.periodic, &structure.species));
             // Positions count from the lowest corner of the box.
             for (a, b) in [(0, 1), (0, 2)] {

@@ -9,7 +9,8 @@ pub fn sentence(point: &TracePoint) -> String {
     let mut parts = vec![format!("{:.0} K", point.temperature)];
     parts.extend(point.pressure.map(|pressure| format!("{pressure:.2} GPa")));
     parts.push(format!("V/V₀ {:.4}", point.relative_volume));
-    parts.push(format!("γ_max {}", decimals(point.gamma_max, 2)));
+    let original = point.gamma_max_original.map(|gamma| format!(", under the original mixture {gamma:.2}"));
+    parts.push(format!("γ_max {}{}", decimals(point.gamma_max, 2), original.unwrap_or_default()));
     if point.bias_scale != 0.0 {
         let share = 100.0 * point.bias_share;
         parts.push(format!("τ_r {:.3} eV, {share:.1} % of the force", point.bias_scale));
@@ -33,9 +34,9 @@ mod tests {
             TracePoint { step: 150, temperature: 612.4, relative_volume: 1.0, ..TracePoint::default() };
         assert_eq!(sentence(&point), "trace at step 150: 612 K, V/V₀ 1.0000, γ_max –");
         point.pressure = Some(-0.25);
-        point.gamma_max = Some(1.234);
+        (point.gamma_max, point.gamma_max_original) = (Some(1.234), Some(2.5));
         (point.bias_scale, point.bias_share, point.bias_work) = (0.5, 0.126, 3.0);
-        let expected = "trace at step 150: 612 K, -0.25 GPa, V/V₀ 1.0000, γ_max 1.23, τ_r 0.500 eV, 12.6 % of the force, \
+        let expected = "trace at step 150: 612 K, -0.25 GPa, V/V₀ 1.0000, γ_max 1.23, under the original mixture 2.50, τ_r 0.500 eV, 12.6 % of the force, \
                         work of the bias so far 3.00 eV";
         assert_eq!(sentence(&point), expected);
     }

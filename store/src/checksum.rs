@@ -122,6 +122,11 @@ pub static ASSIGNMENT: CheckedTable = checked!("assignment" by walk Integer {
     reference_step: Integer,
 });
 
+/// Trajectories of walks, in parts. Its messages name the walk.
+pub static TRAJECTORY: CheckedTable = checked!("trajectory" by walk Integer {
+    walk: Integer, part: Integer, frames: Integer, data: Bytes,
+});
+
 /// V₀ of walks at constant pressure.
 pub static REFERENCE_VOLUME: CheckedTable =
     checked!("reference_volume" by walk Integer { walk: Integer, volume: Real });

@@ -40,6 +40,7 @@ mod sqlite;
 mod status;
 mod store;
 mod tables;
+mod trajectory;
 mod versions;
 mod walk_progress;
 mod walk_trace;

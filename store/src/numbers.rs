@@ -2,15 +2,16 @@
 //!
 //! Measured or computed numbers are nearly random in all but their first bytes: compression saved a tenth of the
 //! size of features and took longer than writing that tenth. Numbers are therefore stored uncompressed: one word
-//! with [`PLAIN`] and their count, then the numbers, little-endian. Compressed rows of earlier versions can still
-//! be read: a word with the count alone, then one zstd frame of the bytes by significance (all first bytes, then
-//! all second bytes …).
+//! with [`PLAIN`] and their count, then the numbers, little-endian. Whole numbers, those of trajectories, are compressed,
+//! and earlier versions compressed all: a word with the count alone, then one zstd frame of the bytes by significance
+//! (all first bytes, then all second bytes …).
 
 use std::io::{self, Read};
 
 /// Set in the first word of uncompressed arrays.
 const PLAIN: u64 = 1 << 63;
 const WORD: usize = size_of::<u64>();
+const ZSTD_LEVEL: i32 = 1;
 
 /// Why bytes are not an array of numbers.
 #[derive(Debug, thiserror::Error)]
@@ -41,6 +42,16 @@ pub fn encode_numbers(numbers: &[f64]) -> Vec<u8> {
             *place = number.to_le_bytes();
         }
     }
+    bytes
+}
+
+/// Encodes numbers for a column, compressed.
+pub fn compress_numbers(numbers: &[f64]) -> Vec<u8> {
+    let planes: Vec<u8> =
+        (0..WORD).flat_map(|plane| numbers.iter().map(move |x| x.to_le_bytes()[plane])).collect();
+    let mut bytes = (numbers.len() as u64).to_le_bytes().to_vec();
+    zstd::stream::copy_encode(planes.as_slice(), &mut bytes, ZSTD_LEVEL)
+        .expect("memory is written to memory");
     bytes
 }
 
@@ -80,22 +91,13 @@ mod tests {
 
     use super::*;
 
-    /// Compresses numbers as earlier versions did.
-    fn compress(numbers: &[f64]) -> Vec<u8> {
-        let planes: Vec<u8> =
-            (0..8).flat_map(|plane| numbers.iter().map(move |x| x.to_le_bytes()[plane])).collect();
-        let mut bytes = (numbers.len() as u64).to_le_bytes().to_vec();
-        zstd::stream::copy_encode(planes.as_slice(), &mut bytes, 1).unwrap();
-        bytes
-    }
-
     proptest! {
         #![proptest_config(ProptestConfig { rng_seed: RngSeed::Fixed(8), ..ProptestConfig::default() })]
 
         #[test]
         fn every_bit_is_preserved(bits in proptest::collection::vec(any::<u64>(), 0..300)) {
             let numbers: Vec<f64> = bits.iter().map(|b| f64::from_bits(*b)).collect();
-            for bytes in [encode_numbers(&numbers), compress(&numbers)] {
+            for bytes in [encode_numbers(&numbers), compress_numbers(&numbers)] {
                 let back = decode_numbers(&bytes).unwrap();
                 prop_assert_eq!(&bits, &back.iter().map(|x| x.to_bits()).collect::<Vec<_>>());
             }
@@ -118,7 +120,9 @@ mod tests {
 
     #[test]
     fn a_wrong_count_and_missing_bytes_are_detected() {
-        for (bytes, found) in [(encode_numbers(&[1.0, 2.0, 3.0]), 24), (compress(&[1.0, 2.0, 3.0]), 17)] {
+        for (bytes, found) in
+            [(encode_numbers(&[1.0, 2.0, 3.0]), 24), (compress_numbers(&[1.0, 2.0, 3.0]), 17)]
+        {
             let mut wrong = bytes.clone();
             wrong[0] = 2;
             let error = decode_numbers(&wrong).unwrap_err();

@@ -7,7 +7,8 @@ use atoms::{Matrix3, Structure, Vec3};
 use serde::{Deserialize, Serialize};
 use wire::messages::{AssignmentStart, DeclineReason, PathPosition, WalkProgress};
 use wire::{
-    CampaignId, CandidateBlock, CandidateId, ContentHash, Origin, TracePoint, WalkConditions, WalkId,
+    CampaignId, CandidateBlock, CandidateId, ContentHash, Origin, TracePoint, WalkConditions, WalkFrame,
+    WalkId,
 };
 
 /// Name of the value with the grades of the training frames under the newest mixture (JSON of
@@ -257,6 +258,8 @@ pub struct Commit {
     pub traces: Vec<(WalkId, Vec<TracePoint>)>,
     /// Assignments of walks, in order.
     pub assignments: Vec<AssignmentRecord>,
+    /// The frames of these assignments.
+    pub trajectories: Vec<TrajectoryPart>,
 }
 
 /// An assignment of a walk, or a part of one that was interrupted: with it, the walk can be run again.
@@ -272,6 +275,17 @@ pub struct AssignmentRecord {
     pub start: AssignmentStart,
     /// Where it ended.
     pub end: PathPosition,
+}
+
+/// The frames of a walk's trajectory in an assignment, or in a part of one.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TrajectoryPart {
+    /// The walk.
+    pub walk: WalkId,
+    /// [`AssignmentRecord::part`].
+    pub part: u64,
+    /// In order.
+    pub frames: Vec<WalkFrame>,
 }
 
 /// A label: the result of a reference calculation for a structure.

@@ -6,7 +6,9 @@ use crate::error::StoreError;
 use crate::numbers::{decode_numbers, encode_numbers};
 
 /// Number of quantities of a point. Later versions add theirs at the end: the column says how many it has.
-const QUANTITIES: usize = 19;
+const QUANTITIES: usize = 20;
+/// That of the first version, without γ_max under the original mixture.
+const FIRST_QUANTITIES: usize = 19;
 /// Whole numbers above are not exact in a column of f64.
 const LARGEST: f64 = 9_007_199_254_740_992.0;
 
@@ -24,10 +26,11 @@ pub(crate) fn encode(points: &[TracePoint]) -> Vec<u8> {
 pub(crate) fn decode(walk: u32, count: usize, bytes: &[u8]) -> Result<Vec<TracePoint>, StoreError> {
     let damaged = |reason: String| StoreError::damaged(format!("the trace of walk {walk}"), reason);
     let numbers = decode_numbers(bytes).map_err(|error| damaged(error.to_string()))?;
-    if numbers.len() < count.saturating_mul(QUANTITIES) || !numbers.len().is_multiple_of(count.max(1)) {
+    if numbers.len() < count.saturating_mul(FIRST_QUANTITIES) || !numbers.len().is_multiple_of(count.max(1)) {
         return Err(damaged(format!("{} numbers for {count} points", numbers.len())));
     }
-    let row = |k: usize| std::array::from_fn(|quantity| numbers[quantity * count + k]);
+    let number = |place: usize| numbers.get(place).copied().unwrap_or(f64::NAN);
+    let row = |k: usize| std::array::from_fn(|quantity| number(quantity * count + k));
     let point =
         |k| point(&row(k)).ok_or_else(|| damaged(format!("point {k} has numbers that are not whole")));
     (0..count).map(point).collect()
@@ -55,6 +58,7 @@ fn quantities(point: &TracePoint) -> [f64; QUANTITIES] {
         point.cell_gain,
         point.bias_share,
         point.bias_work,
+        point.gamma_max_original.unwrap_or(f64::NAN),
     ]
 }
 
@@ -80,6 +84,7 @@ fn point(quantities: &[f64; QUANTITIES]) -> Option<TracePoint> {
         cell_gain,
         bias_share,
         bias_work,
+        gamma_max_original,
     ] = *quantities;
     let given = |x: f64| (!x.is_nan()).then_some(x);
     Some(TracePoint {
@@ -97,6 +102,7 @@ fn point(quantities: &[f64; QUANTITIES]) -> Option<TracePoint> {
         cell_gain,
         bias_share,
         bias_work,
+        gamma_max_original: given(gamma_max_original),
     })
 }
 
@@ -124,10 +130,12 @@ mod tests {
             cell_gain: 0.25,
             bias_share: 0.125,
             bias_work: 2.5,
+            gamma_max_original: Some(3.5),
         };
         let cell = None;
         let sparse = TracePoint { number: 4, step: 1 << 53, pressure: None, cell, ..full.clone() };
-        vec![full, TracePoint { conserved_energy: None, gamma_max: None, ..sparse }]
+        let sparse = TracePoint { conserved_energy: None, gamma_max: None, ..sparse };
+        vec![full, TracePoint { gamma_max_original: None, ..sparse }]
     }
 
     #[test]
@@ -139,6 +147,19 @@ mod tests {
         let mut numbers = decode_numbers(&bytes).unwrap();
         numbers.extend([9.0; 2]);
         assert_eq!(decode(7, 2, &encode_numbers(&numbers)).unwrap(), points);
+    }
+
+    #[test]
+    fn points_of_the_first_version_have_no_grade_under_the_original_mixture() {
+        let mut numbers = decode_numbers(&encode(&points())).unwrap();
+        numbers.truncate(2 * FIRST_QUANTITIES);
+        let expected = points().into_iter().map(|point| TracePoint { gamma_max_original: None, ..point });
+        let expected: Vec<_> = expected.collect();
+        let found = decode(7, 2, &encode_numbers(&numbers)).unwrap();
+        assert_eq!(found, expected);
+        // Later points of the same walk have it.
+        let joined = [found, points()].concat();
+        assert_eq!(decode(7, 4, &encode(&joined)).unwrap(), joined);
     }
 
     #[test]

@@ -14,13 +14,14 @@ use wire::messages::DeclineReason;
 
 use crate::assignments::assignment;
 use crate::common::*;
+use crate::trajectory::trajectory_part;
 use crate::version_records::{version_files, version_record};
 use crate::walk_trace::trace_point;
 
 /// Columns whose bits are flipped: numbers of labels, structures, features, grades, decisions, the mixture, walks,
 /// archives, seed structures, imports, versions of the potential, traces and assignments of walks. Keys are left out: foreign keys and other rows
 /// check them.
-const COLUMNS: [(&str, &[&str]); 17] = [
+const COLUMNS: [(&str, &[&str]); 18] = [
     ("structure", &["hash", "atoms", "data", "checksum"]),
     ("seed_structure", &["structure", "checksum"]),
     ("protocol", &["hash", "checksum"]),
@@ -97,6 +98,7 @@ const COLUMNS: [(&str, &[&str]); 17] = [
     ),
     ("version_file", &["data"]),
     ("walk_trace", &["points", "data", "checksum"]),
+    ("trajectory", &["frames", "data", "checksum"]),
     (
         "assignment",
         &[
@@ -151,7 +153,9 @@ async fn full(directory: &Path, accepted: u64) -> Store {
         walks[0].progress.reference_volume = Some(540.25);
         let traces = vec![(walks[0].walk, vec![trace_point(step - 1)])];
         let (assignments, rest) = (vec![assignment(0, step - 1)], commit_of(records));
-        store.commit(&Commit { walks, components, values, traces, assignments, ..rest }).await.unwrap();
+        let trajectories = vec![trajectory_part(0, step - 1, 2)];
+        let commit = Commit { walks, components, values, traces, assignments, trajectories, ..rest };
+        store.commit(&commit).await.unwrap();
     }
     for number in 0..accepted * 3 / 4 {
         let lease = store.lease(protocol("dft").hash, "l", 0, 600).await.unwrap().unwrap();
@@ -395,7 +399,7 @@ async fn a_database_of_an_earlier_version_gets_checksums() {
 /// Turns it into a database of version 8 by undoing what later versions add and rename.
 async fn without_checksums(directory: &Path) {
     let mut connection = connect(directory).await;
-    let mut sql = "DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
+    let mut sql = "DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
     DROP TABLE walk_trace; DROP INDEX job_order; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
         CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
         DROP TABLE version_file; DROP TABLE version;

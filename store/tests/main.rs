@@ -20,6 +20,7 @@ mod processes;
 mod queue;
 mod queue_model;
 mod relabel;
+mod trajectory;
 mod version_records;
 mod versions;
 mod walk_trace;

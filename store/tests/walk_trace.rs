@@ -21,6 +21,7 @@ pub fn trace_point(number: u64) -> TracePoint {
         cell_gain: 0.0,
         bias_share: 0.15,
         bias_work: 0.01 * number as f64,
+        gamma_max_original: (!number.is_multiple_of(13)).then_some(0.5 * number as f64),
     }
 }
 

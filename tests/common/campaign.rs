@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use store::{ComponentRecord, ExportFilter, Location, Store, VersionRecord};
-use wire::TracePoint;
+use wire::{TracePoint, WalkFrame, WalkId};
 
 use super::config;
 
@@ -37,6 +37,9 @@ method = { native = { epochs = 2, validation_share = 0.0 } }
 test_sets = [{ name = "known", file = "replay.extxyz" }]
 comparisons = [{ name = "known", file = "replay.extxyz" }]
 "#;
+
+/// Steps between two frames of the trajectories.
+pub const TRAJECTORY_INTERVAL: u64 = 25;
 
 /// Number of structures of the replay data.
 const REPLAY: usize = 6;
@@ -83,6 +86,7 @@ temperature = 700.0
 biased_steps = {steps}
 equilibration_steps = 20
 tau = 0.3
+trajectory_interval = {TRAJECTORY_INTERVAL}
 volume_ramp = {{ from = 1.0, to = 1.25 }}
 [collect]
 criterion = {{ rule = "atom_count", threshold = 1.0, fraction = 0.1 }}
@@ -135,6 +139,7 @@ pub struct Outcome {
     pub components: Vec<ComponentRecord>,
     pub walks: Vec<(u32, String, u64, Option<Vec<u8>>)>,
     pub traces: Vec<Vec<TracePoint>>,
+    pub trajectories: Vec<Vec<WalkFrame>>,
     pub dataset: Vec<u8>,
     /// Versions of the potential: everything but time and cost.
     pub versions: Vec<VersionRecord>,
@@ -190,8 +195,9 @@ pub fn outcome_at(location: &str, directory: &Path) -> Outcome {
         let store = Store::open_read_only(location).await.expect("the campaign's database");
         check_consistency(&store).await;
         let walks = store.load_walks().await.expect("walks");
-        let mut traces = Vec::new();
+        let (mut traces, mut trajectories) = (Vec::new(), Vec::new());
         for walk in &walks {
+            trajectories.push(frames(&store, walk.walk).await);
             traces.push(store.walk_trace(walk.walk).await.expect("a trace"));
         }
         let versions = store.versions().await.expect("versions").into_iter();
@@ -201,6 +207,7 @@ pub fn outcome_at(location: &str, directory: &Path) -> Outcome {
             decisions: store.decision_log_text().await.expect("decisions"),
             components: store.load_components().await.expect("components"),
             traces,
+            trajectories,
             walks: walks
                 .into_iter()
                 .map(|walk| (walk.walk.0, walk.state, walk.assignments, walk.checkpoint))
@@ -208,6 +215,20 @@ pub fn outcome_at(location: &str, directory: &Path) -> Outcome {
             dataset: fs::read(&output).expect("the exported data set"),
         }
     })
+}
+
+/// The frames of a walk. Those that a walker made that seemed lost are left out.
+async fn frames(store: &Store, walk: WalkId) -> Vec<WalkFrame> {
+    let mut frames = Vec::<WalkFrame>::new();
+    for record in store.assignments(walk).await.expect("records") {
+        for frame in store.trajectory_part(walk, record.part).await.expect("frames") {
+            while frames.last().is_some_and(|last| (last.segment, last.step) >= (frame.segment, frame.step)) {
+                frames.pop();
+            }
+            frames.push(frame);
+        }
+    }
+    frames
 }
 
 /// Every accepted candidate has one label, decisions are numbered without gaps, and the queue is empty.

@@ -275,6 +275,16 @@ impl BiasedPotential {
         Ok(&self.grades)
     }
 
+    /// γ of the atoms that [`BiasedPotential::grades`] graded, under another mixture.
+    ///
+    /// # Errors
+    /// Features that are not finite.
+    pub fn grades_under(&self, mixture: &Mixture) -> Result<Grades, GradeError> {
+        let mut grades = Grades::default();
+        grades.evaluate(mixture, &self.elements, self.features(), None)?;
+        Ok(grades)
+    }
+
     fn evaluate_biased(
         &mut self,
         structure: &Structure,

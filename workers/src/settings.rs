@@ -34,6 +34,10 @@ pub struct WalkSettings {
     pub cell_bias: CellBiasSettings,
     /// Steps between two points of the trace; 0: none.
     pub trace_interval: u64,
+    /// Steps between two frames of the trajectory; 0: none.
+    pub trajectory_interval: u64,
+    /// Largest number of frames in a report, 1 or more. An assignment with more is interrupted, and goes on after the report.
+    pub max_frames: usize,
     /// Whether the energy that an update of the mixture gives to a biased walk is taken out of its kinetic energy.
     pub remove_update_work: bool,
     /// Neighbour-list skin, Å.

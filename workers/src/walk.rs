@@ -11,6 +11,7 @@ mod start;
 mod state;
 mod step_view;
 mod trace;
+mod trajectory;
 mod update_work;
 
 use std::sync::Arc;
@@ -23,7 +24,7 @@ use potentials::{ModelWithFeatures, Wall, Zbl};
 use wire::messages::{
     Assignment, AssignmentReport, AssignmentStart, Outcome, Verdict, WalkEnd, WalkProgress,
 };
-use wire::{Candidate, Origin, TracePoint};
+use wire::{Candidate, Origin, TracePoint, WalkFrame};
 
 use crate::bias::{BiasedPotential, UngradedError};
 use crate::cell_bias::CellBias;
@@ -31,8 +32,8 @@ use crate::guard;
 use crate::settings::WalkSettings;
 use error::WalkError;
 use start::start;
-pub use state::has_known_layout;
 use state::{GoodState, WalkState};
+pub use state::{has_known_layout, is_same_state};
 pub use step_view::StepView;
 
 /// Data shared by every walk of a campaign.
@@ -44,6 +45,8 @@ pub struct WalkContext {
     pub threads: Threads,
     /// The settings.
     pub settings: Arc<WalkSettings>,
+    /// The original mixture of the walks' version of the potential, for their traces.
+    pub original: Arc<Mixture>,
 }
 
 /// Runs an assignment until it ends: with a candidate, at its last step, with the end of the walk, or when
@@ -97,6 +100,7 @@ pub fn advance_observed(
         checkpoint: running.encode(),
         progress: running.progress(),
         trace: running.take_trace(),
+        frames: running.frames,
     })
 }
 
@@ -114,6 +118,7 @@ pub(crate) fn without_a_step(assignment: &Assignment, reason: String) -> Assignm
         checkpoint: assignment.checkpoint.clone().unwrap_or_default(),
         progress: WalkProgress::default(),
         trace: Vec::new(),
+        frames: Vec::new(),
     }
 }
 
@@ -132,8 +137,10 @@ struct RunningWalk<'a> {
     collection: CollectionRule,
     dynamics: Dynamics,
     potential: BiasedPotential,
+    original: &'a Mixture,
     state: WalkState,
     trace: Vec<TracePoint>,
+    frames: Vec<WalkFrame>,
 }
 
 impl<'a> RunningWalk<'a> {
@@ -142,7 +149,7 @@ impl<'a> RunningWalk<'a> {
         assignment: &'a Assignment,
         mixture: Arc<Mixture>,
     ) -> Result<Self, WalkError> {
-        let WalkContext { model, threads, settings } = context;
+        let WalkContext { model, threads, settings, original } = context;
         let species = &assignment.seed_structure.species;
         let zbl = settings.zbl.as_ref().map(|windows| Zbl::new(species, windows)).transpose()?;
         let mixture_version = mixture.version();
@@ -172,8 +179,10 @@ impl<'a> RunningWalk<'a> {
             collection,
             dynamics,
             potential,
+            original,
             state,
             trace: Vec::new(),
+            frames: Vec::new(),
         })
     }
 
@@ -215,6 +224,7 @@ impl<'a> RunningWalk<'a> {
             return Ok(interrupted);
         }
         if begins {
+            self.add_frame_if_due();
             on_step(&mut StepView { walk: self });
         }
         let last = self.settings.equilibration_steps + self.settings.biased_steps;
@@ -228,11 +238,12 @@ impl<'a> RunningWalk<'a> {
             if self.step() >= self.assignment.last_step {
                 return Ok(Outcome::StepsDone);
             }
-            if stopping() {
+            if stopping() || self.frames_are_full() {
                 return Ok(Outcome::Interrupted);
             }
             self.advance_one_step()?;
             self.trace_step()?;
+            self.add_frame_if_due();
             on_step(&mut StepView { walk: self });
             if let Some(outcome) = self.inspect_step()? {
                 return Ok(outcome);

@@ -5,15 +5,15 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use atoms::{Matrix3, Structure};
 use md::{BarostatSettings, Dynamics, DynamicsSettings, State, Stream};
-use potentials::grace::{Grace, Threads};
+use potentials::grace::Grace;
 use wire::messages::{Assignment, AssignmentReport, Outcome, WalkEnd};
 use wire::{Candidate, ConstantPressure, Origin, WalkConditions};
 use workers::bias::BiasedPotential;
 use workers::cell_bias::CellBiasSettings;
 use workers::settings::WalkSettings;
-use workers::walk::{WalkContext, advance};
+use workers::walk::advance;
 
-use crate::walk::{assignment, mixture, model, never, run, seed_structure, settings, whole_walk};
+use crate::walk::{assignment, context, mixture, model, never, run, seed_structure, settings, whole_walk};
 
 const REFERENCE_STEPS: u64 = 60;
 
@@ -81,8 +81,7 @@ fn a_reference_run_and_a_biased_cell_continue_from_any_step() {
     let settings = WalkSettings { cell_bias: quick(), ..at_constant_pressure() };
     let whole = run(&settings, &from(conditions(1.02, true), 90));
     assert_eq!((&whole.outcome, whole.progress.step), (&Outcome::StepsDone, 90));
-    let context =
-        WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings.clone()) };
+    let context = context(settings.clone());
     // Interrupted twice in the reference run, of which an assignment makes as many steps as it would make of the walk.
     let undisturbed = run(&settings, &from(conditions(1.02, true), 40));
     assert_eq!((&undisturbed.outcome, undisturbed.progress.step), (&Outcome::StepsDone, 0));

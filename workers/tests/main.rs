@@ -11,5 +11,6 @@ mod deep_models;
 mod labeller;
 mod norm_interval;
 mod trace;
+mod trajectory;
 mod update_work;
 mod walk;

@@ -10,6 +10,7 @@ use wire::messages::{Assignment, Outcome};
 use wire::{Origin, TracePoint, WalkConditions};
 use workers::bias::BiasedPotential;
 use workers::settings::WalkSettings;
+use workers::walk::is_same_state;
 
 use crate::walk::{
     assignment, conditions, first_of, mixture, model, never, reference, run, seed_structure, settings,
@@ -237,9 +238,12 @@ fn the_trace_changes_no_result() {
     let at = |trace_interval: u64| {
         let settings = WalkSettings { trace_interval, collection: never(), ..settings() };
         let report = run(&settings, &assignment(seed_structure("vacancy"), 90));
-        (report.progress, report.outcome, report.trace.len())
+        (report.progress, report.outcome, report.trace.len(), report.checkpoint)
     };
-    let ((progress, outcome, points), (with, same, one)) = (at(0), at(7));
+    let ((progress, outcome, points, plain), (with, same, one, traced)) = (at(0), at(7));
     assert_eq!((with, same), (progress, outcome));
     assert_eq!((points, one), (0, 13));
+    assert!(plain != traced && is_same_state(&plain, &traced) == Some(true));
+    let later = run(&settings(), &assignment(seed_structure("vacancy"), 91)).checkpoint;
+    assert_eq!((is_same_state(&plain, &later), is_same_state(&plain, b"")), (Some(false), None));
 }

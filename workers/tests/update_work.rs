@@ -4,13 +4,12 @@ use std::sync::Arc;
 
 use atoms::units::BOLTZMANN;
 use calm::{Batch, CovarianceUpdate, Mixture};
-use potentials::grace::Threads;
-use wire::Candidate;
 use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd};
+use wire::{Candidate, Origin};
 use workers::settings::{GuardSettings, WalkSettings};
-use workers::walk::{WalkContext, advance};
+use workers::walk::advance;
 
-use crate::walk::{assignment, mixture, model, run, seed_structure, settings, whole_walk};
+use crate::walk::{assignment, context, mixture, model, run, seed_structure, settings, whole_walk};
 
 /// Collects every 40 steps from the first biased one on.
 fn eager() -> WalkSettings {
@@ -19,8 +18,7 @@ fn eager() -> WalkSettings {
 }
 
 fn under(settings: &WalkSettings, mixture: Arc<Mixture>, next: &Assignment) -> AssignmentReport<Candidate> {
-    let context =
-        WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings.clone()) };
+    let context = context(settings.clone());
     advance(&context, next, mixture, || false, |_| {}).unwrap()
 }
 
@@ -92,25 +90,48 @@ fn the_work_of_the_bias_goes_on_with_the_smaller_velocities() {
 }
 
 /// The work is taken out once, however the walk is interrupted.
+/// A walk with two candidates, and the mixture that takes in a third.
+fn after_an_update(settings: &WalkSettings, before: &Arc<Mixture>) -> (Assignment, Arc<Mixture>) {
+    let mut next = assignment(seed_structure("vacancy"), 500);
+    for _ in 0..2 {
+        let report = run(settings, &next);
+        (next.checkpoint, next.verdict) = (Some(report.checkpoint), Some(Verdict::Accepted));
+    }
+    let report = run(settings, &next);
+    let Outcome::Candidate(candidate) = report.outcome else { panic!("no candidate") };
+    let elements = model().element_indices(&candidate.structure.species).unwrap();
+    let changed = Batch::new(before, &elements, &candidate.features)
+        .unwrap()
+        .updated(CovarianceUpdate::Convex { alpha: 0.1 })
+        .unwrap();
+    let after = before.at_version(before.version() + 1).with_changes(&changed).unwrap();
+    (next, Arc::new(after))
+}
+
+#[test]
+fn traces_have_the_grade_under_the_original_mixture_too() {
+    let settings = WalkSettings { trace_interval: 4, remove_update_work: false, ..eager() };
+    let before = mixture();
+    let (next, after) = after_an_update(&settings, &before);
+    let control = assignment(next.seed_structure.clone(), 80);
+    let control = Assignment { origin: Origin::Control, ..control };
+    for steps in [Assignment { last_step: 80, ..next }, control] {
+        let original = under(&settings, Arc::clone(&before), &steps).trace;
+        let live = under(&settings, Arc::clone(&after), &steps).trace;
+        assert!(original.len() > 2, "{}", original.len());
+        assert!(original.iter().all(|point| point.gamma_max_original == point.gamma_max));
+        // The first steps after the update, whose bias has hardly moved an atom.
+        let (live, original) = (&live[0], &original[0]);
+        let [found, expected] = [live.gamma_max_original, original.gamma_max].map(Option::unwrap);
+        assert!((found / expected - 1.0).abs() < 0.02, "{live:?} {original:?}");
+        assert!(live.gamma_max < Some(0.98 * expected), "{live:?} {original:?}");
+    }
+}
+
 #[test]
 fn an_interruption_after_an_update_changes_nothing() {
     let (settings, before) = (eager(), mixture());
-    let mut next = assignment(seed_structure("vacancy"), 500);
-    for _ in 0..2 {
-        let report = run(&settings, &next);
-        (next.checkpoint, next.verdict) = (Some(report.checkpoint), Some(Verdict::Accepted));
-    }
-    let after = Arc::new(before.at_version(before.version() + 1));
-    let changed = {
-        let report = run(&settings, &next);
-        let Outcome::Candidate(candidate) = report.outcome else { panic!("no candidate") };
-        let elements = model().element_indices(&candidate.structure.species).unwrap();
-        Batch::new(&before, &elements, &candidate.features)
-            .unwrap()
-            .updated(CovarianceUpdate::Convex { alpha: 0.1 })
-            .unwrap()
-    };
-    let after = Arc::new(after.with_changes(&changed).unwrap());
+    let (mut next, after) = after_an_update(&settings, &before);
     next.last_step = 80;
     let whole = under(&settings, Arc::clone(&after), &next);
     let kept = WalkSettings { remove_update_work: false, ..settings.clone() };

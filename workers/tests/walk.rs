@@ -55,6 +55,8 @@ pub fn settings() -> WalkSettings {
         cell_bias: CellBiasSettings::default(),
         remove_update_work: false,
         trace_interval: 50,
+        trajectory_interval: 0,
+        max_frames: 64,
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'").unwrap(),
         min_interval: 200,
@@ -101,9 +103,14 @@ pub fn assignment(structure: Structure, until: u64) -> Assignment {
 }
 
 pub fn run(settings: &WalkSettings, assignment: &Assignment) -> AssignmentReport<Candidate> {
-    let context =
-        WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings.clone()) };
+    let context = context(settings.clone());
     advance(&context, assignment, mixture(), || false, |_| {}).unwrap()
+}
+
+/// What walks with these settings share; the original mixture is that of [`mixture`].
+pub fn context(settings: WalkSettings) -> WalkContext {
+    let (model, threads, settings) = (model(), Threads::default(), Arc::new(settings));
+    WalkContext { model, threads, settings, original: mixture() }
 }
 
 /// The first 150 steps of a walk under these conditions.
@@ -190,7 +197,7 @@ fn damaged_checkpoints_do_not_stop_a_walker() {
     let settings = WalkSettings { collection: never(), ..settings() };
     let mut next = assignment(seed_structure("vacancy"), 110);
     let checkpoint = run(&settings, &next).checkpoint;
-    let context = WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings) };
+    let context = context(settings);
     let mixture = mixture();
     next.last_step = 115;
     let mut refused = 0;
@@ -339,7 +346,7 @@ fn the_checkpoint_does_not_grow_with_collections() {
     let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 1e-9").unwrap();
     let guard = GuardSettings { checkpoint_interval: 20, ..settings().guard };
     let settings = WalkSettings { collection, min_interval: 1, trace_interval: 0, guard, ..settings() };
-    let context = WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings) };
+    let context = context(settings);
     let (mut next, mixture) = (first_of("vacancy", conditions()), mixture());
     let mut sizes = Vec::new();
     for _ in 0..200 {

@@ -18,7 +18,7 @@ use crate::structure::Structure;
 
 pub use error::{DumpError, DumpErrorKind};
 use sections::{DumpAtom, DumpColumns, SimulationBox};
-pub use write::{DumpSnapshot, write_snapshot};
+pub use write::{DumpMotion, DumpSnapshot, write_snapshot};
 
 /// Iterates over the snapshots of a stream. Ends after the first error.
 ///

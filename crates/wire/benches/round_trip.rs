@@ -102,7 +102,16 @@ fn walk(door: &ConnectInfo) {
             let checkpoint = vec![0; CHECKPOINT];
             let progress = WalkProgress::default();
             let (walk, assignment, trace, start) = (WalkId(0), trip as u64, Vec::new(), None);
-            let report = AssignmentReport { walk, assignment, start, outcome, checkpoint, progress, trace };
+            let report = AssignmentReport {
+                walk,
+                assignment,
+                start,
+                outcome,
+                checkpoint,
+                progress,
+                trace,
+                frames: Vec::new(),
+            };
             let (begin, encoding) = (Instant::now(), walker.encoding());
             let work = walker.exchange(Some(report)).expect("an assignment");
             let (whole, encode) = (begin.elapsed(), walker.encoding() - encoding);
@@ -142,7 +151,8 @@ async fn orchestrate() {
     let place = ShmDir::for_campaign(directory.path()).expect("a place");
     let sizes = Sizes { walkers: 1, message_bytes: 5 << 20 };
     let prepared = place.prepare(space_needed(&sizes)).expect("enough shared memory");
-    let mixtures = SharedMixture::create(&place.mixture(), &mixture(), 1).expect("a shared mixture");
+    let mut mixtures = SharedMixture::create(&place.mixture(), &mixture(), 1).expect("a shared mixture");
+    mixtures.publish_original(&mixture()).expect("room for it");
     let server = IpcServer::open(&place, sizes, 1).expect("a transport");
     let handle = server.handle();
     handle.expect(0, 1);

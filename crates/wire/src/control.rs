@@ -18,10 +18,11 @@ use serde::{Deserialize, Serialize};
 use crate::block::CandidateBlock;
 use crate::ids::{CandidateId, Origin, WalkId};
 use crate::messages::{Assignment, AssignmentReport, AssignmentStart, Outcome, WalkEnd, WalkProgress};
+use crate::walk_frame::WalkFrame;
 use crate::walk_trace::TracePoint;
 
 const MAGIC: [u8; 4] = *b"CALM";
-const VERSION: u8 = 5;
+const VERSION: u8 = 6;
 const PREFIX: usize = MAGIC.len() + 1 + 4;
 
 /// Why bytes are not a valid control message.
@@ -106,6 +107,7 @@ pub(crate) struct EncodedReport<'a> {
     checkpoint: &'a [u8],
     progress: Cow<'a, WalkProgress>,
     trace: Cow<'a, [TracePoint]>,
+    frames: Cow<'a, [WalkFrame]>,
 }
 
 /// An [`Outcome`] with the candidate replaced by its id.
@@ -127,9 +129,10 @@ impl<'a> EncodedReport<'a> {
             Outcome::Ended(end) => EncodedOutcome::Ended(Cow::Borrowed(end)),
         };
         let (checkpoint, progress) = (report.checkpoint.as_slice(), Cow::Borrowed(&report.progress));
-        let trace = Cow::Borrowed(report.trace.as_slice());
+        let (trace, frames) =
+            (Cow::Borrowed(report.trace.as_slice()), Cow::Borrowed(report.frames.as_slice()));
         let (walk, assignment, start) = (report.walk, report.assignment, Cow::Borrowed(&report.start));
-        Self { walk, assignment, start, outcome, checkpoint, progress, trace }
+        Self { walk, assignment, start, outcome, checkpoint, progress, trace, frames }
     }
 
     /// The report with its candidate, which arrived separately.
@@ -137,7 +140,7 @@ impl<'a> EncodedReport<'a> {
         self,
         candidate: Option<CandidateBlock>,
     ) -> Result<AssignmentReport, ControlError> {
-        let Self { walk, assignment, start, outcome, checkpoint, progress, trace } = self;
+        let Self { walk, assignment, start, outcome, checkpoint, progress, trace, frames } = self;
         let outcome = checked_outcome(walk, outcome, candidate)?;
         Ok(AssignmentReport {
             walk,
@@ -147,6 +150,7 @@ impl<'a> EncodedReport<'a> {
             checkpoint: checkpoint.to_vec(),
             progress: progress.into_owned(),
             trace: trace.into_owned(),
+            frames: frames.into_owned(),
         })
     }
 }

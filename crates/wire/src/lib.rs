@@ -19,6 +19,7 @@ pub mod net;
 mod protocol;
 pub mod shm_dir;
 pub mod transport;
+mod walk_frame;
 mod walk_trace;
 
 pub use block::{BlockError, Candidate, CandidateBlock, CandidateView};
@@ -27,4 +28,5 @@ pub use conditions::{ConstantPressure, WalkConditions};
 pub use device_statistics::DeviceStatistics;
 pub use ids::{CampaignId, CandidateId, ContentHash, IdError, Origin, WalkId};
 pub use mixture::{MixtureReader, SharedMixture, SharedMixtureError};
+pub use walk_frame::WalkFrame;
 pub use walk_trace::{MAX_KEPT_POINTS, TracePoint, thin};

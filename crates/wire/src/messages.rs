@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use crate::block::CandidateBlock;
 use crate::conditions::WalkConditions;
 use crate::ids::{CampaignId, Origin, WalkId};
+use crate::walk_frame::WalkFrame;
 use crate::walk_trace::TracePoint;
 
 /// A piece of one walk, for any idle walker.
@@ -203,6 +204,8 @@ pub struct AssignmentReport<C = CandidateBlock> {
     pub progress: WalkProgress,
     /// The points of the walk's trace since the last report, thinned ([`crate::thin`]).
     pub trace: Vec<TracePoint>,
+    /// The frames of the walk's trajectory since the last report.
+    pub frames: Vec<WalkFrame>,
 }
 
 impl<C> AssignmentReport<C> {
@@ -214,8 +217,8 @@ impl<C> AssignmentReport<C> {
             Outcome::Interrupted => Outcome::Interrupted,
             Outcome::Ended(end) => Outcome::Ended(end),
         };
-        let Self { walk, assignment, start, checkpoint, progress, trace, .. } = self;
-        AssignmentReport { walk, assignment, start, outcome, checkpoint, progress, trace }
+        let Self { walk, assignment, start, checkpoint, progress, trace, frames, .. } = self;
+        AssignmentReport { walk, assignment, start, outcome, checkpoint, progress, trace, frames }
     }
 }
 

@@ -41,6 +41,9 @@ pub struct TracePoint {
     pub bias_share: f64,
     /// Work done by the force of the bias since the start of the walk, along its path, eV.
     pub bias_work: f64,
+    /// Largest γ under the original mixture; `None` if the structure cannot be graded, and in points of earlier versions.
+    #[serde(default)]
+    pub gamma_max_original: Option<f64>,
 }
 
 /// Removes points that a walk with so many does not keep. With 2ᵏ the smallest power of two by which the number of points of

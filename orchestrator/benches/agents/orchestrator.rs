@@ -42,7 +42,8 @@ pub async fn lead(plan: Plan) {
     let tokens = StopTokens::default();
     // The same capacity as in `calmwalk run`.
     let (to_reactor, incoming) = mpsc::channel(64);
-    let server = tokio::spawn(server.run(Arc::clone(selector.mixture()), tokens.clone(), to_reactor, |_| {}));
+    let mixture = Arc::clone(selector.mixture());
+    let server = tokio::spawn(server.run(Arc::clone(&mixture), mixture, tokens.clone(), to_reactor, |_| {}));
     let program = std::env::current_exe().unwrap();
     let arguments = [plan.rate, plan.duration.as_secs_f64(), f64::from(plan.port), plan.begun];
     let arguments = arguments.map(|number| number.to_string());

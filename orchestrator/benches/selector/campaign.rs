@@ -121,6 +121,7 @@ pub fn report(assignment: &Assignment, block: Option<CandidateBlock>) -> Assignm
         progress: progress(assignment.number),
         start: None,
         trace: Vec::new(),
+        frames: Vec::new(),
     }
 }
 

@@ -7,8 +7,17 @@ use store::records::Commit;
 
 /// Appends `later` to `commit`.
 pub fn append(commit: &mut Commit, later: Commit) {
-    let Commit { decisions, candidates, components, restart_mixture, walks, values, traces, assignments } =
-        later;
+    let Commit {
+        decisions,
+        candidates,
+        components,
+        restart_mixture,
+        walks,
+        values,
+        traces,
+        assignments,
+        trajectories,
+    } = later;
     commit.decisions.extend(decisions);
     commit.candidates.extend(candidates);
     if restart_mixture {
@@ -17,6 +26,7 @@ pub fn append(commit: &mut Commit, later: Commit) {
     }
     commit.traces.extend(traces);
     commit.assignments.extend(assignments);
+    commit.trajectories.extend(trajectories);
     // Of records that are overwritten, only the newest is kept.
     replace(&mut commit.components, components, |component| (component.element, component.slot));
     replace(&mut commit.walks, walks, |walk| walk.walk);

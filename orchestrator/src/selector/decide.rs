@@ -37,10 +37,10 @@ impl DecisionState {
     ) -> Result<Commit, SelectorError> {
         let mut commit = Commit::default();
         let mut touched = BTreeSet::new();
-        for report in reports {
+        for mut report in reports {
             let id = report.walk;
             touched.insert(id);
-            let (steps, accepted) = (self.apply_report(&report, &mut commit), self.accepted);
+            let (steps, accepted) = (self.apply_report(&mut report, &mut commit), self.accepted);
             commit.traces.push((id, report.trace));
             match report.outcome {
                 Outcome::Candidate(regraded) => {
@@ -87,10 +87,10 @@ impl DecisionState {
 
     /// Updates the walk from the report, and logs rollbacks. Returns the number of steps of the assignment if the walk is
     /// biased; 0 if it rolled back behind its start.
-    fn apply_report(&mut self, report: &RegradedReport, commit: &mut Commit) -> u64 {
+    fn apply_report(&mut self, report: &mut RegradedReport, commit: &mut Commit) -> u64 {
         let steps_per_assignment = self.settings.steps_per_assignment;
         let walk = self.walks.count_report(report.walk);
-        commit.assignments.extend(walk.assignment_record(report));
+        walk.record_assignment(report, commit);
         let steps = match walk.is_biased() {
             true => report.progress.step.saturating_sub(walk.counted_step(steps_per_assignment)),
             false => 0,

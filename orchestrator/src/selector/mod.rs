@@ -104,6 +104,11 @@ impl Selector {
         &self.decisions.mixture
     }
 
+    /// The original mixture of the version of the potential in force.
+    pub fn original(&self) -> &Arc<Mixture> {
+        &self.decisions.regrader.original
+    }
+
     /// How near the alarm over a mixture that forgets its training data is: it is raised above 1.
     pub fn forgetting_level(&self) -> f64 {
         self.decisions.forgetting_state().level
@@ -201,7 +206,7 @@ impl Selector {
         let WalkRecord { assignments: number, checkpoint, progress, .. } = walk.record.clone();
         let (checkpoint, outcome) =
             (checkpoint.unwrap_or_default(), Outcome::Ended(WalkEnd::Diverged { reason }));
-        let (start, trace) = (None, Vec::new());
+        let (start, trace, frames) = (None, Vec::new(), Vec::new());
         self.report(AssignmentReport {
             walk: id,
             assignment: number,
@@ -210,6 +215,7 @@ impl Selector {
             checkpoint,
             progress,
             trace,
+            frames,
         })
     }
 

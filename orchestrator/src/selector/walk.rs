@@ -1,7 +1,7 @@
 //! A walk, as the selector sees it.
 
 use serde::{Deserialize, Serialize};
-use store::records::{AssignmentRecord, Commit, WalkRecord};
+use store::records::{AssignmentRecord, Commit, TrajectoryPart, WalkRecord};
 use wire::messages::{AssignmentReport, Verdict, WalkEnd, WalkProgress};
 use wire::{Origin, WalkConditions, WalkId};
 
@@ -110,22 +110,31 @@ impl Walk {
 
     /// Records where an assignment was interrupted; it continues from there. The checkpoint already accounts for the
     /// verdict with which it started.
-    pub fn interrupt<C>(&mut self, report: AssignmentReport<C>) -> Commit {
-        let assignments = self.assignment_record(&report).into_iter().collect();
+    pub fn interrupt<C>(&mut self, mut report: AssignmentReport<C>) -> Commit {
+        let mut commit = Commit::default();
+        self.record_assignment(&mut report, &mut commit);
         self.record.checkpoint = Some(report.checkpoint);
         self.record.progress = report.progress;
         self.state.verdict = None;
-        let traces = vec![(self.record.walk, report.trace)];
-        Commit { walks: vec![self.to_record()], traces, assignments, ..Commit::default() }
+        commit.traces.push((self.record.walk, report.trace));
+        commit.walks.push(self.to_record());
+        commit
     }
 
-    /// What the store keeps of an assignment, or of the part of it that was interrupted. Counts the records.
-    pub fn assignment_record<C>(&mut self, report: &AssignmentReport<C>) -> Option<AssignmentRecord> {
-        let (start, records) = (report.start.clone()?, self.state.records.as_mut()?);
+    /// Adds to a commit what the store keeps of an assignment, or of the part of it that was interrupted, with the frames of its trajectory.
+    /// Counts the records.
+    pub fn record_assignment<C>(&mut self, report: &mut AssignmentReport<C>, commit: &mut Commit) {
+        let (Some(start), Some(records)) = (report.start.clone(), self.state.records.as_mut()) else {
+            return;
+        };
         let part = *records;
         *records += 1;
         let (walk, number, end) = (self.record.walk, report.assignment, report.progress.position());
-        Some(AssignmentRecord { walk, part, number, start, end })
+        commit.assignments.push(AssignmentRecord { walk, part, number, start, end });
+        let frames = std::mem::take(&mut report.frames);
+        if !frames.is_empty() {
+            commit.trajectories.push(TrajectoryPart { walk, part, frames });
+        }
     }
 
     /// Whether it ended only because of a limit.

@@ -232,6 +232,7 @@ pub fn report(assignment: &Assignment, outcome: Outcome, progress: WalkProgress)
         progress,
         start: None,
         trace: Vec::new(),
+        frames: Vec::new(),
     }
 }
 

@@ -75,6 +75,7 @@ pub fn advance(
         progress: progress(&state),
         start: None,
         trace: Vec::new(),
+        frames: Vec::new(),
     }
 }
 

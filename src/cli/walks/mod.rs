@@ -1,6 +1,7 @@
 //! `calmwalk walks`
 
 mod trace;
+mod trajectory;
 
 use store::{Location, Store, unix_milliseconds};
 use wire::WalkId;
@@ -8,6 +9,7 @@ use wire::WalkId;
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::print;
 pub use trace::TraceArgs;
+pub use trajectory::TrajectoryArgs;
 
 /// Show or pause walks
 ///
@@ -29,6 +31,8 @@ enum WalksAction {
     Change(WalksCommand),
     /// Write the trace of a walk as CSV (docs/walk-diagnostics.md)
     Trace(TraceArgs),
+    /// Write the recorded trajectory of a walk as extended XYZ or a LAMMPS dump (docs/walk-diagnostics.md)
+    Trajectory(TrajectoryArgs),
 }
 
 #[derive(Clone, Debug, PartialEq, clap::Subcommand)]
@@ -58,6 +62,7 @@ impl WalksArgs {
                 print(|out| messages.iter().try_for_each(|line| writeln!(out, "{line}")))?;
             }
             WalksAction::Trace(trace) => block_on(trace.run(&location))??,
+            WalksAction::Trajectory(trajectory) => block_on(trajectory.run(&location))??,
         }
         Ok(ExitStatus::Done)
     }

@@ -14,7 +14,7 @@ use crate::csv::{Csv, number};
 use crate::output::print;
 
 /// Names of the columns, in the order of [`row`].
-const COLUMNS: [&str; 19] = [
+const COLUMNS: [&str; 20] = [
     "number",
     "segment",
     "step",
@@ -34,6 +34,7 @@ const COLUMNS: [&str; 19] = [
     "cell_gain",
     "bias_share",
     "bias_work",
+    "gamma_max_original",
 ];
 
 #[derive(Debug, clap::Args)]
@@ -68,5 +69,6 @@ fn row(point: &TracePoint) -> Vec<String> {
     cells.extend((0..6).map(|k| number(point.cell.map(|cell| cell[k]))));
     let bias = [point.bias_scale, point.cell_gain, point.bias_share, point.bias_work];
     cells.extend([point.conserved_energy, point.gamma_max].into_iter().chain(bias.map(Some)).map(number));
+    cells.push(number(point.gamma_max_original));
     cells
 }

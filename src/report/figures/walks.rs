@@ -128,7 +128,10 @@ fn caption(group: &GroupTraces, threshold: Option<f64>) -> String {
         }
     };
     let threshold = threshold.map_or(String::new(), |threshold| {
-        format!(" γ_{{max}} is under the walker’s mixture; dashed, the threshold {threshold} of the collection rule.")
+        format!(
+            " γ_{{max}} is under the walker’s mixture, or the original one where the axis says so; dashed, the threshold {threshold} of the \
+             collection rule."
+        )
     });
     format!(
         "{of} along their steps, equilibration included: {how}.{threshold} τ_{{r}} is the factor on the gradient of Σγ in the force, \

@@ -67,7 +67,7 @@ function drawn({ points, threshold, origin }, candidates, inPs) {
     panel("Temperature", { title: "T (K)" }, (point) => point.temperature),
     panel("Pressure", { title: "P (GPa)" }, (point) => point.pressure),
     panel("Volume", { title: "V/V₀" }, (point) => point.relative_volume),
-    grade({ x, at, last, threshold, line: line((point) => point.gamma_max), candidates }),
+    grade({ x, at, last, threshold, points, line, candidates }),
   ];
   if (origin === "biased") {
     panels.push(
@@ -83,9 +83,13 @@ function drawn({ points, threshold, origin }, candidates, inPs) {
   return panels;
 }
 
-/** γ_max under the walker's mixture, that of the candidates under the original one, and the threshold. */
-function grade({ x, at, last, threshold, line, candidates }) {
-  const lines = [{ name: "the walker's mixture", colour: LINES[0], points: line }];
+/** γ_max under the walker's mixture and under the original one, candidates under the original one, and the threshold. */
+function grade({ x, at, last, threshold, points, line, candidates }) {
+  const lines = [{ name: "the walker's mixture", colour: LINES[0], points: line((point) => point.gamma_max) }];
+  // Points of earlier versions have none.
+  if (points.some((point) => point.gamma_max_original != null)) {
+    lines.push({ name: "original mixture", colour: LINES[1], dash: DASHES[2], points: line((point) => point.gamma_max_original) });
+  }
   if (threshold != null) lines.push({ name: "threshold", colour: LINES[4], dash: DASHES[1], points: [[0, threshold], [at(last), threshold]] });
   const marks = Object.entries(FATES).map(([name, look]) => ({ name: `${words(name)} (original mixture)`, ...look,
     points: candidates.filter((one) => (one.origin === "control" ? "control" : one.fate) === name && one.gamma != null)

@@ -44,7 +44,7 @@ macro_rules! table {
 
 /// All tables except those of the leader, of processes and their progress, and of job counts, which triggers count
 /// again. Each table comes after those that it references. A new database already has some rows of `campaign`.
-const TABLES: [CopiedTable; 22] = [
+const TABLES: [CopiedTable; 23] = [
     table!("campaign" { key: T, value: T, checksum: I }),
     table!("value" { name: T, value: T, checksum: I }),
     table!("structure" { number: I, hash: B, atoms: I, formula: T, data: B, checksum: I }),
@@ -75,6 +75,7 @@ const TABLES: [CopiedTable; 22] = [
         walk: I, part: I, number: I, mixture_version: I, threshold_factor: R, verdict: T, start_segment: I, start_step: I,
         start_reference_step: I, segment: I, step: I, reference_step: I, checksum: I,
     }),
+    table!("trajectory" 8 { walk: I, part: I, frames: I, data: B, checksum: I }),
     table!("reference_volume" { walk: I, volume: R, checksum: I }),
     table!("job" {
         number: I, structure: I, protocol: I, decision: I, state: T, priority: I, holder: T, expires: I, attempts: I,

@@ -1,6 +1,6 @@
 //! Computes missing checksums, and verifies every row of tables that no other check reads.
 
-use super::assignments;
+use super::{assignments, trajectory};
 use crate::checksum::{
     ARCHIVE, CAMPAIGN, CANDIDATE, CHECKPOINT, COMPONENT, CheckedColumn, CheckedTable, DECISION, IMPORT,
     LABEL, LONG_COLUMNS, Names, PROTOCOL, SEED_STRUCTURE, STRUCTURE, VALUE, WALK, WALK_CONDITIONS,
@@ -188,7 +188,7 @@ async fn next(
 }
 
 /// Verifies rows that no other check reads: campaign values, seed structures, walks and their
-/// traces and assignments, imports, the selector's values
+/// traces, assignments and trajectories, imports, the selector's values
 /// and the mixture. Returns the faults.
 pub(crate) async fn verify_others(transaction: &mut Transaction) -> Result<Vec<String>> {
     let mut faults = Vec::new();
@@ -215,5 +215,6 @@ pub(crate) async fn verify_others(transaction: &mut Transaction) -> Result<Vec<S
         last = key;
     }
     faults.extend(assignments::verify(transaction).await?);
+    faults.extend(trajectory::verify(transaction).await?);
     Ok(faults)
 }

@@ -11,7 +11,7 @@ use self::rows::{
     WALK_CONDITIONS,
 };
 use super::new_jobs::insert_jobs;
-use super::{assignments, protocols, walk_trace};
+use super::{assignments, protocols, trajectory, walk_trace};
 use crate::Store;
 use crate::database::{Transaction, execute_rows, query};
 use crate::encoding::integer;
@@ -115,6 +115,7 @@ async fn write(transaction: &mut Transaction, commit: &Commit, rows: CommitRows,
     execute_rows(transaction, INSERT_WALK_CONDITIONS, &WALK_CONDITIONS, rows.walk_conditions).await?;
     execute_rows(transaction, UPSERT_VALUES, &VALUE, rows.values).await?;
     assignments::append(transaction, commit).await?;
+    trajectory::append(transaction, rows.trajectories).await?;
     walk_trace::append(transaction, &commit.traces).await
 }
 

@@ -35,6 +35,7 @@ pub mod report;
 mod restore;
 pub mod status;
 pub mod structures;
+mod trajectory;
 pub mod versions;
 mod walk_conditions;
 mod walk_progress;

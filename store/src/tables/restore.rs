@@ -1,9 +1,9 @@
 //! The state from which a selector continues, and complete candidates.
 
 use wire::messages::{DeclineReason, WalkProgress};
-use wire::{CandidateBlock, ContentHash, Origin, WalkConditions, WalkId};
+use wire::{CandidateBlock, ContentHash, Origin, WalkConditions, WalkFrame, WalkId};
 
-use super::{assignments, walk_conditions};
+use super::{assignments, trajectory, walk_conditions};
 use crate::Store;
 use crate::checksum::{
     CANDIDATE, CHECKPOINT, COMPONENT, DECISION, LONG_COLUMNS, Names, STRUCTURE, VALUE, WALK, joined,
@@ -124,6 +124,14 @@ impl Store {
         }
         transaction.commit().await?;
         Ok(found)
+    }
+
+    /// The frames of a part of a walk, see [`AssignmentRecord::part`]. Empty without a trajectory.
+    pub async fn trajectory_part(&self, walk: WalkId, part: u64) -> Result<Vec<WalkFrame>> {
+        let mut transaction = self.database.begin_read().await?;
+        let frames = trajectory::read(&mut transaction, walk, part).await?;
+        transaction.commit().await?;
+        Ok(frames)
     }
 
     /// Every component that has changed since the mixture was last restarted, by element and slot.

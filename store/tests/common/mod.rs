@@ -14,7 +14,8 @@ use wire::messages::WalkProgress;
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
 pub use former_words::{
-    TO_VERSION_15, TO_VERSION_16, TO_VERSION_17, TO_VERSION_19, check_present_words, write_former_words,
+    TO_VERSION_15, TO_VERSION_16, TO_VERSION_17, TO_VERSION_19, TO_VERSION_20, check_present_words,
+    write_former_words,
 };
 pub use test_database::{TestDatabase, server};
 

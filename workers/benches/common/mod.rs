@@ -47,6 +47,7 @@ impl TimedWalk {
             model: model.clone(),
             threads: Threads::default(),
             settings: Arc::new(settings(threshold, ensemble)),
+            original: Arc::clone(mixture),
         };
         let mut assignment = assignment(seed_structure, ensemble, u64::MAX);
         // Any structure is a candidate from the first permitted step on.
@@ -106,6 +107,8 @@ fn settings(threshold: f64, ensemble: Ensemble) -> WalkSettings {
         cell_bias,
         remove_update_work: false,
         trace_interval: 50,
+        trajectory_interval: 0,
+        max_frames: 64,
         skin: 0.5,
         collection: toml::from_str(&format!("rule = 'maximum_grade'\nthreshold = {threshold:e}"))
             .expect("a rule"),

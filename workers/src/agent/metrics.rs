@@ -175,6 +175,7 @@ mod tests {
                 progress: at(0, 1),
                 start: None,
                 trace: Vec::new(),
+                frames: Vec::new(),
             }))
         };
         let ended = || report(Outcome::Ended(WalkEnd::Completed));

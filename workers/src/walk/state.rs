@@ -18,6 +18,15 @@ pub fn has_known_layout(checkpoint: &[u8]) -> bool {
     checkpoint.starts_with(LAYOUT)
 }
 
+/// Whether two checkpoints are of the same state, however many points the traces of their walks have; `None` if one of them cannot be read.
+pub fn is_same_state(a: &[u8], b: &[u8]) -> Option<bool> {
+    let [a, b] = [a, b].map(|checkpoint| {
+        let state = WalkState::decode(checkpoint).ok()?;
+        Some(WalkState { trace_points: 0, ..state }.encode())
+    });
+    Some(a? == b?)
+}
+
 /// Number of checkpoints kept for roll backs. The oldest one is used, so that a roll back leads out of the trap.
 const MAX_CHECKPOINTS: usize = 2;
 

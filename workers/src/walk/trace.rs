@@ -44,12 +44,7 @@ impl RunningWalk<'_> {
     }
 
     fn trace_point(&mut self) -> Result<TracePoint, WalkError> {
-        let gamma_max = match gamma(&mut self.potential, &self.dynamics).map_err(WalkError::from) {
-            Ok(gamma) => Some(maximum(gamma)),
-            Err(WalkError::Unavailable(reason)) => return Err(WalkError::Unavailable(reason)),
-            // The walk continues, or ends where its grades are needed.
-            Err(_) => None,
-        };
+        let (gamma_max, gamma_max_original) = self.largest_grades()?;
         self.separate_bias()?;
         let trace = |tensor: &Matrix3| tensor[0][0] + tensor[1][1] + tensor[2][2];
         // The dynamics know no virial of the bias.
@@ -70,7 +65,20 @@ impl RunningWalk<'_> {
             cell_gain: self.state.cell_bias.as_ref().map_or(0.0, CellBias::gain),
             bias_share: self.potential.bias_share(),
             bias_work: self.potential.state.work.total,
+            gamma_max_original,
         })
+    }
+
+    /// γ_max under the walker's mixture and under the original one, if the structure can be graded.
+    fn largest_grades(&mut self) -> Result<(Option<f64>, Option<f64>), WalkError> {
+        let gamma_max = match gamma(&mut self.potential, &self.dynamics).map_err(WalkError::from) {
+            Ok(gamma) => maximum(gamma),
+            Err(WalkError::Unavailable(reason)) => return Err(WalkError::Unavailable(reason)),
+            // The walk continues, or ends where its grades are needed.
+            Err(_) => return Ok((None, None)),
+        };
+        let original = self.potential.grades_under(self.original).ok();
+        Ok((Some(gamma_max), original.map(|grades| maximum(&grades.gamma))))
     }
 }
 

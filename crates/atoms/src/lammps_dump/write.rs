@@ -19,12 +19,18 @@ pub struct DumpSnapshot<'a> {
     pub timestep: u64,
     /// fs.
     pub time: f64,
+    /// [n], if they are known.
+    pub motion: Option<DumpMotion<'a>>,
+    /// Further columns: name, and [n] numbers.
+    pub scalars: Vec<(&'a str, &'a [f64])>,
+}
+
+/// Velocities and forces of a snapshot.
+pub struct DumpMotion<'a> {
     /// [n], Å/fs.
     pub velocities: &'a [Vec3],
     /// [n], eV/Å.
     pub forces: &'a [Vec3],
-    /// Further columns: name, and [n] numbers.
-    pub scalars: Vec<(&'a str, &'a [f64])>,
 }
 
 /// Writes a snapshot: unwrapped positions (Å), velocities (Å/ps) and forces (eV/Å). A cell that is not orthogonal is written as a general
@@ -39,7 +45,8 @@ pub fn write_snapshot(out: &mut impl Write, snapshot: &DumpSnapshot<'_>) -> io::
     writeln!(text, "ITEM: UNITS\nmetal\nITEM: TIME\n{}", snapshot.time / FEMTOSECONDS)?;
     writeln!(text, "ITEM: TIMESTEP\n{}\nITEM: NUMBER OF ATOMS\n{}", snapshot.timestep, structure.len())?;
     write_box(&mut text, structure)?;
-    write!(text, "ITEM: ATOMS id type element xu yu zu vx vy vz fx fy fz")?;
+    let motion = if snapshot.motion.is_some() { " vx vy vz fx fy fz" } else { "" };
+    write!(text, "ITEM: ATOMS id type element xu yu zu{motion}")?;
     snapshot.scalars.iter().try_for_each(|(name, _)| write!(text, " {name}"))?;
     writeln!(text)?;
     let mut elements = Vec::new();
@@ -49,8 +56,10 @@ pub fn write_snapshot(out: &mut impl Write, snapshot: &DumpSnapshot<'_>) -> io::
             elements.len() - 1
         });
         write!(text, "{} {} {}", atom + 1, kind + 1, species.symbol())?;
-        let velocity = snapshot.velocities[atom].map(|v| v * FEMTOSECONDS);
-        for number in [structure.positions[atom], velocity, snapshot.forces[atom]].as_flattened() {
+        let motion = snapshot.motion.iter().flat_map(|DumpMotion { velocities, forces }| {
+            [velocities[atom].map(|v| v * FEMTOSECONDS), forces[atom]]
+        });
+        for number in std::iter::once(structure.positions[atom]).chain(motion).flatten() {
             write!(text, " {number}")?;
         }
         snapshot.scalars.iter().try_for_each(|(_, numbers)| write!(text, " {}", numbers[atom]))?;

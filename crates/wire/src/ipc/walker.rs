@@ -4,9 +4,11 @@ use std::borrow::Cow;
 use std::cell::Cell;
 use std::fmt::Display;
 use std::mem::MaybeUninit;
+use std::sync::Arc;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
+use calm::Mixture;
 use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
@@ -19,7 +21,7 @@ use crate::block::Candidate;
 use crate::control::encode;
 use crate::ids::WalkId;
 use crate::messages::{AssignmentReport, WalkProgress};
-use crate::mixture::{MixtureReader, SharedMixtureError};
+use crate::mixture::{MixtureReader, ORIGINAL, SharedMixtureError};
 use crate::protocol::frame;
 use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
 use crate::shm_dir;
@@ -43,6 +45,7 @@ pub struct IpcWalker {
     wakeup: Listener<Service>,
     server_wakeup: Notifier<Service>,
     mixtures: MixtureReader,
+    original: Arc<Mixture>,
     stopping: CancellationToken,
     sequence: u64,
     failure: Option<IpcError>,
@@ -75,13 +78,15 @@ impl IpcWalker {
             config::client_port(&config::open_requests(&node, sender.session)?, connect_info.message_bytes)?;
         shm_dir::reserve(&connect_info.prefix, Some(port.id().value()))
             .map_err(|e| IpcError::new("reserve its memory", e))?;
-        let mixtures = open_mixture(connect_info)?;
+        let mut mixtures = open_mixture(connect_info)?;
+        let original = mixtures.pin(ORIGINAL)?;
         Ok(Self {
             sender,
             port,
             wakeup,
             server_wakeup,
             mixtures,
+            original,
             stopping,
             sequence: 0,
             failure: None,
@@ -89,6 +94,11 @@ impl IpcWalker {
             message_bytes: connect_info.message_bytes,
             _node: node,
         })
+    }
+
+    /// The original mixture.
+    pub fn original(&self) -> &Arc<Mixture> {
+        &self.original
     }
 
     /// Why the last exchange returned no assignment; `None` if the walker was shut down.

@@ -13,6 +13,7 @@
 //! Lifetimes:
 //! * A **version** lives while it is the newest, or while the writer's process holds the `Arc<Mixture>` that was
 //!   published. A version assigned to a walker therefore exists when the walker pins it.
+//! * The **original** mixture, by which no update is counted, is there as long as the file: walkers grade with it, too.
 //! * A **pin** protects a row for the microseconds in which a reader copies it. [`pinning`] explains why this is
 //!   sufficient.
 //! * A **reference count** per reader and block counts the components of this reader that use the block. It is
@@ -34,6 +35,11 @@ mod memory;
 mod pinning;
 mod reader;
 mod writer;
+
+use pinning::NONE;
+
+/// The number under which the original mixture is published, whichever version it is. No version has it.
+pub const ORIGINAL: u64 = NONE - 1;
 
 pub use error::SharedMixtureError;
 pub use reader::MixtureReader;

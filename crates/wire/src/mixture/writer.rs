@@ -9,6 +9,7 @@ use std::{fmt, io};
 
 use calm::Mixture;
 
+use super::ORIGINAL;
 use super::allocator::BlockAllocator;
 use super::error::SharedMixtureError;
 use super::index::MixtureIndex;
@@ -26,6 +27,8 @@ pub struct SharedMixture {
     living: Vec<Option<LiveVersion>>,
     /// The newest version and its row; new versions are compared with it.
     latest: Option<(Mixture, Vec<u32>)>,
+    /// Keeps the original mixture available.
+    original: Option<Arc<Mixture>>,
 }
 
 /// A version that readers can pin.
@@ -95,7 +98,7 @@ impl SharedMixture {
         index.clear();
         let mut living = Vec::new();
         living.resize_with(layout.rows as usize, || None);
-        let mut shared = Self { layout, index, blocks, living, latest: None };
+        let mut shared = Self { layout, index, blocks, living, latest: None, original: None };
         let blocks = shared.write(mixture)?;
         shared.publish_row(0, mixture, blocks, Vec::new());
         shared.layout.write(file).map_err(|source| failed("write the header", source))?;
@@ -127,6 +130,18 @@ impl SharedMixture {
         let row = row.ok_or(SharedMixtureError::TooManyVersions { version, living })?;
         let blocks = self.write(mixture)?;
         self.publish_row(row, mixture, blocks, vec![Arc::downgrade(mixture)]);
+        Ok(())
+    }
+
+    /// Publishes the original mixture, for good, as [`ORIGINAL`]. It shares the blocks of the components that the newest version has not changed;
+    /// each of the others needs about 8 D² bytes.
+    ///
+    /// # Errors
+    /// See [`SharedMixture::publish`].
+    pub fn publish_original(&mut self, original: &Mixture) -> Result<(), SharedMixtureError> {
+        let original = Arc::new(original.at_version(ORIGINAL));
+        self.publish(&original)?;
+        self.original = Some(original);
         Ok(())
     }
 
@@ -168,7 +183,7 @@ impl SharedMixture {
             word.store(block, Ordering::Relaxed);
         }
         self.index.version(row as u32).store_release(version);
-        if self.latest.is_none() || version > self.newest() {
+        if self.latest.is_none() || (version != ORIGINAL && version > self.newest()) {
             self.index.newest().store_release(version);
             self.latest = Some((mixture.clone(), blocks.clone()));
         }

@@ -22,6 +22,7 @@ use super::handshake;
 use super::message::{AGENTS, AgentInfo, AgentReply, AgentRequest, ORCHESTRATOR};
 use super::side::ConnectionSide;
 use crate::control::{ControlError, decode, encode};
+use crate::mixture::ORIGINAL;
 use crate::protocol::frame;
 
 /// Timeout of a request, after which it is repeated.
@@ -61,6 +62,8 @@ pub struct Membership {
     first_slot: u32,
     /// The newest version last; locked while a version is fetched.
     mixtures: Mutex<VecDeque<Arc<Mixture>>>,
+    /// The original mixture.
+    pub original: Arc<Mixture>,
     /// Configuration for starting walkers.
     pub setup: Vec<u8>,
 }
@@ -208,15 +211,49 @@ impl AgentClient {
     async fn try_join(self: &Arc<Self>) -> Result<Membership, LinkError> {
         let answer = self.request(&AgentRequest::Join(self.agent.clone())).await?;
         let AgentReply::Joined(reply) = decode_reply(&answer)? else { return Err(unexpected("join")) };
-        let membership = Membership {
+        let newest = Arc::new(self.fetch_mixture(reply.session, None, reply.mixture_version).await?);
+        let original = Arc::new(self.fetch_mixture(reply.session, Some(&newest), ORIGINAL).await?);
+        Ok(Membership {
             client: Arc::clone(self),
             session: reply.session,
             first_slot: reply.first_slot,
-            mixtures: Mutex::default(),
+            mixtures: Mutex::new(VecDeque::from([newest])),
+            original,
             setup: reply.setup.to_vec(),
-        };
-        membership.mixture(reply.mixture_version).await?;
-        Ok(membership)
+        })
+    }
+
+    /// Fetches a version of the mixture; a delta if the orchestrator still has the base version.
+    async fn fetch_mixture(
+        &self,
+        session: u64,
+        base: Option<&Arc<Mixture>>,
+        wanted: u64,
+    ) -> Result<Mixture, LinkError> {
+        let have = base.map(|base| base.version());
+        let mut receiver: Option<DeltaReceiver> = None;
+        loop {
+            let skip = receiver.as_ref().map_or(0, DeltaReceiver::received);
+            let request = AgentRequest::Mixture { session, have, wanted, skip };
+            let answer = self.request(&request).await?;
+            let AgentReply::Mixture(part) = decode_reply(&answer)? else { return Err(unexpected("mixture")) };
+            let received = match &mut receiver {
+                Some(received) if received.is_next(&part) => received,
+                // The orchestrator has discarded the base version in the meantime: start over without it.
+                Some(_) => {
+                    receiver = None;
+                    continue;
+                }
+                None => receiver.insert(DeltaReceiver::new(
+                    &part,
+                    base.filter(|_| part.from.is_some()).map(|base| &**base),
+                )?),
+            };
+            if received.add_part(&part)? {
+                break;
+            }
+        }
+        Ok(receiver.expect("the loop ends with one").finish()?)
     }
 
     /// Sends a request once; `None` if there is no answer in time, or no link.
@@ -293,38 +330,11 @@ impl Membership {
         if let Some(mixture) = mixtures.iter().find(|mixture| mixture.version() == version) {
             return Ok(Arc::clone(mixture));
         }
-        let mixture = Arc::new(self.fetch(mixtures.back(), version).await?);
+        let mixture = Arc::new(self.client.fetch_mixture(self.session, mixtures.back(), version).await?);
         mixtures.push_back(Arc::clone(&mixture));
         let older = mixtures.len().saturating_sub(MAX_VERSIONS);
         mixtures.drain(..older);
         Ok(mixture)
-    }
-
-    async fn fetch(&self, base: Option<&Arc<Mixture>>, wanted: u64) -> Result<Mixture, LinkError> {
-        let have = base.map(|base| base.version());
-        let mut receiver: Option<DeltaReceiver> = None;
-        loop {
-            let skip = receiver.as_ref().map_or(0, DeltaReceiver::received);
-            let request = AgentRequest::Mixture { session: self.session, have, wanted, skip };
-            let answer = self.client.request(&request).await?;
-            let AgentReply::Mixture(part) = decode_reply(&answer)? else { return Err(unexpected("mixture")) };
-            let received = match &mut receiver {
-                Some(received) if received.is_next(&part) => received,
-                // The orchestrator has discarded the base version in the meantime: start over without it.
-                Some(_) => {
-                    receiver = None;
-                    continue;
-                }
-                None => receiver.insert(DeltaReceiver::new(
-                    &part,
-                    base.filter(|_| part.from.is_some()).map(|base| &**base),
-                )?),
-            };
-            if received.add_part(&part)? {
-                break;
-            }
-        }
-        Ok(receiver.expect("the loop ends with one").finish()?)
     }
 
     /// Fetches a file for walkers by the hash of its content.

@@ -18,7 +18,7 @@ use super::agent_event::AgentEvent;
 use super::certificates::Tls;
 use super::endpoint::{self, Endpoint};
 use super::message::{AGENTS, ORCHESTRATOR};
-use super::session::AgentSession;
+use super::session::{AgentMixtures, AgentSession};
 use super::side::ConnectionSide;
 use super::{AgentBootstrap, NetError};
 use crate::transport::Incoming;
@@ -80,20 +80,22 @@ impl AgentServer {
     }
 
     /// Handles requests of agents and forwards reports to the reactor until [`StopTokens::closing`], and then
-    /// until every agent has left or is lost. `mixture` is the current mixture. `on_event` is called for every event
-    /// of an agent.
+    /// until every agent has left or is lost. `mixture` is the current mixture, `original` the original one. `on_event` is called for
+    /// every event of an agent.
     ///
     /// # Errors
     /// The zenoh session was closed.
     pub async fn run(
         self,
         mixture: Arc<Mixture>,
+        original: Arc<Mixture>,
         StopTokens { stopping, closing }: StopTokens,
         to_reactor: mpsc::Sender<Incoming>,
         mut on_event: impl FnMut(AgentEvent) + Send + 'static,
     ) -> Result<(), NetError> {
+        let mixtures = AgentMixtures::new(mixture, &original);
         let mut state =
-            AgentSession::new(self.session_id, self.agent_timeout, self.bootstrap, mixture, stopping);
+            AgentSession::new(self.session_id, self.agent_timeout, self.bootstrap, mixtures, stopping);
         let mut is_closing = false;
         let mut expiry = tokio::time::interval(EXPIRY_INTERVAL);
         expiry.set_missed_tick_behavior(MissedTickBehavior::Delay);

@@ -17,6 +17,7 @@ use super::message::{AgentInfo, AgentReply, AgentRequest, JoinReply};
 use super::registry::{AgentRegistry, RegisteredAgent};
 use super::replies::Replies;
 use crate::control::decode;
+use crate::mixture::ORIGINAL;
 use crate::protocol::frame;
 use crate::protocol::rejected::RejectedMessage;
 use crate::protocol::sequence::SenderMismatch;
@@ -39,8 +40,33 @@ pub(super) struct AgentSession {
     /// Whether agents should stop.
     stopping: CancellationToken,
     registry: AgentRegistry,
+    mixtures: AgentMixtures,
+}
+
+/// The mixtures that agents may fetch, besides those of their assignments.
+pub(super) struct AgentMixtures {
+    /// As [`ORIGINAL`].
+    original: Arc<Mixture>,
     /// The newest version last.
     versions: VecDeque<Arc<Mixture>>,
+}
+
+impl AgentMixtures {
+    pub(super) fn new(newest: Arc<Mixture>, original: &Mixture) -> Self {
+        Self { original: Arc::new(original.at_version(ORIGINAL)), versions: VecDeque::from([newest]) }
+    }
+
+    fn newest(&self) -> &Arc<Mixture> {
+        self.versions.back().expect("the first version is not removed before another is added")
+    }
+
+    /// Adds a version if it is a newer one.
+    fn add(&mut self, mixture: &Arc<Mixture>) {
+        if mixture.version() > self.newest().version() {
+            self.versions.push_back(Arc::clone(mixture));
+            self.versions.drain(..self.versions.len().saturating_sub(MAX_VERSIONS));
+        }
+    }
 }
 
 impl AgentSession {
@@ -48,7 +74,7 @@ impl AgentSession {
         session: u64,
         agent_timeout: Duration,
         AgentBootstrap { setup, files }: AgentBootstrap,
-        mixture: Arc<Mixture>,
+        mixtures: AgentMixtures,
         stopping: CancellationToken,
     ) -> Self {
         Self {
@@ -59,7 +85,7 @@ impl AgentSession {
             files: Files::new(files),
             stopping,
             registry: AgentRegistry::new(agent_timeout),
-            versions: VecDeque::from([mixture]),
+            mixtures,
         }
     }
 
@@ -131,14 +157,10 @@ impl AgentSession {
         for slot in member.slots() {
             self.slots.expect(slot, INCARNATION);
         }
-        let (first_slot, mixture_version) = (member.first_slot, self.newest().version());
+        let (first_slot, mixture_version) = (member.first_slot, self.mixtures.newest().version());
         let joined = JoinReply { session: self.session, first_slot, mixture_version, setup: &self.setup };
         self.slots.transport.reply(query, &AgentReply::Joined(joined));
         Ok(())
-    }
-
-    fn newest(&self) -> &Arc<Mixture> {
-        self.versions.back().expect("the first version is not removed before another is added")
     }
 
     fn mixture(
@@ -158,18 +180,17 @@ impl AgentSession {
         Ok(())
     }
 
-    /// A version that agents may need: a recent one, or one of a current assignment.
+    /// A version that agents may need: a recent one, one of a current assignment, or the original.
     fn version(&self, version: u64) -> Option<&Arc<Mixture>> {
-        self.versions.iter().rev().chain(self.slots.mixtures()).find(|mixture| mixture.version() == version)
+        let AgentMixtures { original, versions } = &self.mixtures;
+        let mut all = versions.iter().rev().chain(self.slots.mixtures()).chain([original]);
+        all.find(|mixture| mixture.version() == version)
     }
 
     /// Answers the pending offer of a slot.
     pub(super) fn handle_decision(&mut self, decision: OfferDecision<Query>) {
-        if let Some(WorkItem { mixture, .. }) = &decision.work
-            && mixture.version() > self.newest().version()
-        {
-            self.versions.push_back(Arc::clone(mixture));
-            self.versions.drain(..self.versions.len().saturating_sub(MAX_VERSIONS));
+        if let Some(WorkItem { mixture, .. }) = &decision.work {
+            self.mixtures.add(mixture);
         }
         self.slots.answer(decision);
     }

@@ -34,6 +34,7 @@ pub(crate) struct Envelope<'a> {
 }
 
 #[derive(Serialize, Deserialize)]
+#[expect(clippy::large_enum_variant, reason = "there is never more than one")]
 pub(crate) enum Payload<'a> {
     /// Report on the last assignment, and request for the next.
     Offer {

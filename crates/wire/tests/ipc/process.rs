@@ -75,6 +75,7 @@ fn walk(door: &ConnectInfo, stuck: bool) {
             checkpoint,
             progress,
             trace: vec![],
+            frames: vec![],
         });
     }
     assert!(walker.failure().is_none(), "{:?}", walker.failure());

@@ -77,7 +77,7 @@ fn words(bytes: &[u8]) -> Vec<u64> {
 
 /// Plain data as a control message.
 fn sealed(content: &[u8]) -> Vec<u8> {
-    [b"CALM\x05".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat()
+    [b"CALM\x06".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat()
 }
 
 /// A request with a control message and the bytes after it.
@@ -90,8 +90,9 @@ fn framed(control: &[u8], behind: &[u8]) -> Vec<u8> {
 fn offer(sequence: u8, candidate: &Candidate) -> Vec<u8> {
     let id = candidate.id;
     let (progress, trace) = (wire::messages::WalkProgress::default(), Vec::<wire::TracePoint>::new());
+    let frames = Vec::<wire::WalkFrame>::new();
     let start = None::<wire::messages::AssignmentStart>;
-    let report = (id.walk.0, 1_u64, start, 0_u8, id, &[1_u8, 2][..], progress, trace);
+    let report = (id.walk.0, 1_u64, start, 0_u8, id, &[1_u8, 2][..], progress, trace, frames);
     [&[0, sequence, 1][..], &postcard::to_stdvec(&report).unwrap()].concat()
 }
 

@@ -48,7 +48,8 @@ impl TestServer {
         let place = ShmDir::for_campaign(directory).unwrap();
         let sizes = Sizes { walkers, message_bytes };
         let prepared = place.prepare(space_needed(&sizes)).unwrap();
-        let mixtures = SharedMixture::create(&place.mixture(), &mixture(0), walkers).unwrap();
+        let mut mixtures = SharedMixture::create(&place.mixture(), &mixture(0), walkers).unwrap();
+        mixtures.publish_original(&mixture(0)).unwrap();
         let session = SESSION.fetch_add(1, Ordering::Relaxed);
         let server = IpcServer::open(&place, sizes, session).unwrap();
         let handle = server.handle();

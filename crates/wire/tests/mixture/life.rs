@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use calm::{Component, Grades, Mixture};
 use tempfile::TempDir;
+use wire::mixture::ORIGINAL;
 use wire::{MixtureReader, SharedMixture, SharedMixtureError};
 
 use super::helpers::{DIMENSION, check, first, next, stamped};
@@ -76,6 +77,28 @@ fn a_version_lives_while_its_arc_does() {
     assert!(matches!(gone, Err(SharedMixtureError::VersionNotFound { version: 0, newest: 21 })), "{gone:?}");
     assert!(matches!(reader.pin(7), Err(SharedMixtureError::VersionNotFound { version: 7, .. })));
     assert!(matches!(reader.pin(u64::MAX), Err(SharedMixtureError::VersionNotFound { .. })));
+}
+
+#[test]
+fn the_original_mixture_stays() {
+    let (_folder, path) = place();
+    let original = first();
+    // As in a campaign that continues: the newest version comes first.
+    let mut newest = next(&next(&original));
+    let mut shared = SharedMixture::create(&path, &newest, 1).unwrap();
+    shared.publish_original(&original).unwrap();
+    let mut reader = MixtureReader::open(&path, 0).unwrap();
+    assert_eq!(reader.newest(), 2);
+    let pinned = reader.pin(ORIGINAL).unwrap();
+    for version in 2..80 {
+        check(&reader.pin(version).unwrap());
+        newest = next(&newest);
+        shared.publish(&newest).unwrap();
+        assert_eq!(reader.newest(), version + 1);
+    }
+    let same = reader.pin(ORIGINAL).unwrap();
+    assert_eq!((&*same, &*pinned), (&original.at_version(ORIGINAL), &original.at_version(ORIGINAL)));
+    assert_eq!(*reader.pin(80).unwrap(), *newest);
 }
 
 #[test]

@@ -30,6 +30,7 @@ async fn assignments_and_reports_survive_a_round_trip() {
         assignments
     });
     let mut mixture = Arc::new(mixture());
+    assert_eq!(membership.original.at_version(mixture.version()), *mixture);
     let mut expected = None;
     for number in 1..=20 {
         let mut offer = server.next().await;
@@ -60,6 +61,24 @@ async fn assignments_and_reports_survive_a_round_trip() {
     }
     membership.leave().await;
     server.event(|event| matches!(event, AgentEvent::Left(_))).await;
+    server.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn agents_that_join_late_have_the_original_mixture() {
+    let original = Arc::new(mixture());
+    let newest = next_version(&next_version(&original, 0, 1), 1, 0);
+    let options = ServerOptions { mixture: Arc::clone(&newest), original, ..ServerOptions::default() };
+    let server = TestServer::open(options).await;
+    let (_client, membership) = join(server.port, agent("a", 1)).await;
+    assert_eq!(*membership.newest().await, *newest);
+    let (found, original) = (&membership.original, mixture());
+    assert_eq!(found.at_version(original.version()), original);
+    // What the newest version has not changed is one component for both.
+    let newest = membership.newest().await;
+    let both = newest.iter().zip(found.iter()).filter(|((.., new), (.., old))| Arc::ptr_eq(new, old));
+    assert_eq!(both.count(), original.iter().count() - 2);
+    membership.leave().await;
     server.close().await;
 }
 

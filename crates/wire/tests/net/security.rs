@@ -43,7 +43,7 @@ async fn unexpected_messages_are_rejected_and_reported() {
         String::from_utf8_lossy(&reply.result().unwrap().payload().to_bytes()).into_owned()
     };
     let other_version = [&9_u64.to_le_bytes()[..], b"CALM\x09\0\0\0\0\0\0\0\0\0\0\0"].concat();
-    let damaged = [&9_u64.to_le_bytes()[..], b"CALM\x05\0\0\0\x01\0\0\0\0\0\0\0"].concat();
+    let damaged = [&9_u64.to_le_bytes()[..], b"CALM\x06\0\0\0\x01\0\0\0\0\0\0\0"].concat();
     let cases = [
         (Vec::new(), "request too short: 0 bytes"),
         (vec![1, 2, 3], "the length field alone has 8"),

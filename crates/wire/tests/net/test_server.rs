@@ -46,6 +46,7 @@ pub struct ServerOptions {
     pub session: u64,
     pub agent_timeout: Duration,
     pub mixture: Arc<Mixture>,
+    pub original: Arc<Mixture>,
     pub files: BTreeMap<String, PathBuf>,
     pub tls: Option<Tls>,
 }
@@ -53,13 +54,15 @@ pub struct ServerOptions {
 impl Default for ServerOptions {
     fn default() -> Self {
         let (port, mixture) = (free_port(), Arc::new(mixture()));
-        Self { port, session: 1, agent_timeout: AGENT_TIMEOUT, mixture, files: BTreeMap::new(), tls: None }
+        let original = Arc::clone(&mixture);
+        let (agent_timeout, files) = (AGENT_TIMEOUT, BTreeMap::new());
+        Self { port, session: 1, agent_timeout, mixture, original, files, tls: None }
     }
 }
 
 impl TestServer {
     pub async fn open(wanted: ServerOptions) -> Self {
-        let ServerOptions { port, session, agent_timeout, mixture, files, tls } = wanted;
+        let ServerOptions { port, session, agent_timeout, mixture, original, files, tls } = wanted;
         let welcome = AgentBootstrap { setup: b"the setup".to_vec(), files };
         let server =
             AgentServer::open(&endpoint(port), tls.as_ref(), session, agent_timeout, welcome).await.unwrap();
@@ -68,7 +71,7 @@ impl TestServer {
         let events = Arc::new(Mutex::new(Vec::new()));
         let note = Arc::clone(&events);
         let note = move |event| note.lock().unwrap().push(event);
-        let task = tokio::spawn(server.run(mixture, tokens.clone(), to_reactor, note));
+        let task = tokio::spawn(server.run(mixture, original, tokens.clone(), to_reactor, note));
         Self { port, incoming, events, tokens, task }
     }
 
@@ -214,6 +217,7 @@ pub fn report(assignment: &Assignment) -> AssignmentReport {
         progress: WalkProgress::default(),
         start: None,
         trace: Vec::new(),
+        frames: Vec::new(),
     }
 }
 

@@ -13,6 +13,7 @@ use crate::encoding::{encode_structure, integer};
 use crate::error::{Result, StoreError};
 use crate::numbers::encode_numbers;
 use crate::records::{AtomGrades, CandidateRecord, Commit, Decision, Fate, WalkRecord};
+use crate::tables::trajectory;
 
 /// The values of a row, in the order of the columns.
 type RowValues = Vec<SqlValue>;
@@ -95,6 +96,7 @@ pub(super) struct CommitRows {
     /// For every walk that has no assignment behind it.
     pub walk_conditions: Vec<RowValues>,
     pub values: Vec<RowValues>,
+    pub trajectories: Vec<RowValues>,
 }
 
 impl CommitRows {
@@ -121,6 +123,7 @@ impl CommitRows {
             values: newest(&commit.values, |(name, _)| name)
                 .map(|(name, value)| VALUES.with_checksum(vec![name.into(), value.into()]))
                 .collect(),
+            trajectories: trajectory::rows(&commit.trajectories)?,
         };
         let (mut decided, mut structures) = (decided(commit)?, HashSet::new());
         for record in &commit.candidates {

@@ -37,7 +37,7 @@ fn content(message: &[u8]) -> &[u8] {
 
 /// Arbitrary content as a control message.
 fn encoded(content: &[u8]) -> Vec<u8> {
-    let control = [b"CALM\x05".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat();
+    let control = [b"CALM\x06".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat();
     frame::to_words(&control, None).as_bytes().to_vec()
 }
 
@@ -156,7 +156,7 @@ proptest! {
     fn reports_with_candidates_of_other_walks_are_rejected(sender in sender(), candidate in candidate()) {
         let walk = WalkId(candidate.id.walk.0 ^ 1);
         let (outcome, checkpoint) = (Outcome::Candidate(candidate), Vec::new());
-        let report = AssignmentReport { walk, assignment: 0, start: None, outcome, checkpoint, progress: WalkProgress::default(), trace: vec![] };
+        let report = AssignmentReport { walk, assignment: 0, start: None, outcome, checkpoint, progress: WalkProgress::default(), trace: vec![], frames: vec![] };
         prop_assert!(is_about_the_candidate(&super::request(&offered(sender, 1, Some(&report)))));
     }
 
@@ -206,7 +206,7 @@ fn errors_are_specific() {
         }
     };
     assert_eq!(changed(8), ControlError::Magic(*b"BALM"));
-    assert_eq!(changed(12), ControlError::Version(4));
+    assert_eq!(changed(12), ControlError::Version(7));
     assert!(matches!(changed(13), ControlError::Checksum { .. }));
     assert!(matches!(changed(CONTENT), ControlError::Checksum { .. }));
     let short = |control: &[u8]| super::answer(frame::to_words(control, None).as_bytes());
@@ -244,6 +244,7 @@ fn excessive_lengths_are_rejected() {
         checkpoint,
         progress,
         trace: vec![],
+        frames: vec![],
     };
     let offer = offered(sender, 1, Some(&report));
     assert!(super::request(&offer).is_ok());

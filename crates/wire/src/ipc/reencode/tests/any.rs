@@ -15,6 +15,7 @@ use crate::messages::{
     Assignment, AssignmentReport, AssignmentStart, DeclineReason, Outcome, Verdict, WalkEnd, WalkProgress,
 };
 use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
+use crate::walk_frame::WalkFrame;
 use crate::walk_trace::TracePoint;
 
 fn verdict() -> impl Strategy<Value = Verdict> {
@@ -124,13 +125,14 @@ pub fn report() -> impl Strategy<Value = AssignmentReport<Candidate>> {
         end().prop_map(Outcome::Ended),
     ];
     let names = (any::<u32>(), any::<u64>(), option::of(start()));
-    (names, outcome, vec(any::<u8>(), 0..300), progress(), vec(trace_point(), 0..5)).prop_map(
-        |((walk, assignment, start), outcome, checkpoint, progress, trace)| {
+    let points = (vec(trace_point(), 0..5), vec(walk_frame(), 0..3));
+    (names, outcome, vec(any::<u8>(), 0..300), progress(), points).prop_map(
+        |((walk, assignment, start), outcome, checkpoint, progress, (trace, frames))| {
             let walk = match &outcome {
                 Outcome::Candidate(candidate) => candidate.id.walk,
                 _ => WalkId(walk),
             };
-            AssignmentReport { walk, assignment, start, outcome, checkpoint, progress, trace }
+            AssignmentReport { walk, assignment, start, outcome, checkpoint, progress, trace, frames }
         },
     )
 }
@@ -146,15 +148,30 @@ fn start() -> impl Strategy<Value = AssignmentStart> {
     )
 }
 
+fn walk_frame() -> impl Strategy<Value = WalkFrame> {
+    let numbers = [(); 11].map(|()| -1e3..1e9);
+    (any::<u32>(), any::<u64>(), numbers, vec(any::<[i64; 3]>(), 0..5)).prop_map(
+        |(segment, step, [time, temperature, cell @ ..], positions)| WalkFrame {
+            segment,
+            step,
+            time,
+            temperature,
+            cell: std::array::from_fn(|row| std::array::from_fn(|axis| cell[3 * row + axis])),
+            positions,
+        },
+    )
+}
+
 fn trace_point() -> impl Strategy<Value = TracePoint> {
     let place = (any::<u64>(), any::<u32>(), any::<u64>());
     let (missing, number) = (|| option::of(-1e3..1e9), || -1e3..1e9);
     let state = (number(), number(), missing(), number(), option::of([(); 6].map(|()| 0.0..180.0)));
-    let bias = (missing(), missing(), number(), number(), number(), number());
+    let bias = (missing(), missing(), number(), number(), number(), number(), missing());
     (place, state, bias).prop_map(|(place, state, bias)| {
         let (number, segment, step) = place;
         let (time, temperature, pressure, relative_volume, cell) = state;
-        let (conserved_energy, gamma_max, bias_scale, cell_gain, bias_share, bias_work) = bias;
+        let (conserved_energy, gamma_max, bias_scale, cell_gain, bias_share, bias_work, gamma_max_original) =
+            bias;
         TracePoint {
             number,
             segment,
@@ -170,6 +187,7 @@ fn trace_point() -> impl Strategy<Value = TracePoint> {
             cell_gain,
             bias_share,
             bias_work,
+            gamma_max_original,
         }
     })
 }
