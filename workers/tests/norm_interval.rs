@@ -84,8 +84,8 @@ fn on_the_slab(interval: u64, trace_interval: u64, last_step: u64) -> (WalkSetti
 
 /// The structures of a walk, from its start on.
 fn path(settings: &WalkSettings, first: &Assignment) -> Vec<Structure> {
-    let context =
-        WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings.clone()) };
+    let (model, settings) = (model(), Arc::new(settings.clone()));
+    let context = WalkContext { model, threads: Threads::default(), settings, original: mixture() };
     let mut path = Vec::new();
     let observe = |view: &mut workers::walk::StepView<'_, '_>| path.push(view.structure().clone());
     advance_observed(&context, first, mixture(), || false, |_| {}, observe).unwrap();
