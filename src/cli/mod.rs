@@ -6,6 +6,7 @@ mod calibration;
 mod calm;
 mod campaign_location;
 mod clean;
+mod completions;
 mod dashboard;
 mod doctor;
 mod estimate;
@@ -98,6 +99,8 @@ enum CliCommand {
     Md(md::MdArgs),
     Doctor(doctor::DoctorArgs),
     Clean(clean::CleanArgs),
+    Completions(completions::CompletionsArgs),
+    Man(completions::ManArgs),
     #[command(hide = true)]
     Walker(walker::WalkerArgs),
     #[command(hide = true)]
@@ -144,6 +147,8 @@ pub fn run(arguments: Arguments) -> Result<ExitStatus, CommandError> {
         CliCommand::Md(command) => command.run(),
         CliCommand::Doctor(command) => command.run(),
         CliCommand::Clean(command) => command.run(),
+        CliCommand::Completions(command) => command.run(),
+        CliCommand::Man(command) => command.run(),
         CliCommand::Walker(command) => command.run(),
         CliCommand::Labeller(command) => command.run(),
         CliCommand::Refitter(command) => command.run(),

@@ -9,6 +9,7 @@ mod common;
 mod browser;
 mod dft;
 mod faults;
+mod gracemaker_engine;
 mod gracemaker_refit;
 mod loaders;
 mod pictures;
