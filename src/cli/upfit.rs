@@ -9,7 +9,7 @@ mod report;
 
 use std::path::{Path, PathBuf};
 
-use ::upfit::{CosineDecay, LossSettings, UpfitSettings};
+use ::upfit::{CosineDecay, LossSettings, Optimiser, UpfitSettings};
 
 use self::display::TrainingDisplay;
 use self::fine_tuning::{FineTuned, FineTuning, fine_tune};
@@ -20,7 +20,7 @@ use crate::structure_files::{StructureReadingArgs, file_weight};
 
 /// Fine-tune a GRACE model on labelled structures
 ///
-/// Trains the weights of an export (kokkos.npz, one or two layers) with Adam on energies, forces and stresses, and writes a model file
+/// Trains the weights of an export (kokkos.npz, one or two layers) on energies, forces and stresses, and writes a model file
 /// with the new weights, for calmwalk and LAMMPS. Labels are read as by `calm score`: energy, forces, stress or virial, or the same
 /// with REF_. The result does not depend on the number of threads.
 ///
@@ -74,6 +74,10 @@ pub struct UpfitArgs {
     /// [default: 1]
     #[arg(long, value_name = "FILE=W", value_parser = file_weight)]
     weight: Vec<(PathBuf, f64)>,
+    /// Optimiser. adam: Adam with AMSGrad, as gracemaker has it; soap: Adam in the eigenbases of Shampoo's preconditioners, which needs fewer
+    /// epochs (docs/upfit.md); start with --learning-rate 0.01
+    #[arg(long, value_name = "NAME", value_enum, default_value_t = OptimiserName::Adam)]
+    optimiser: OptimiserName,
     /// Learning rate of the first update; it falls by half a cosine
     #[arg(long, value_name = "RATE", default_value_t = 1e-3, value_parser = positive)]
     learning_rate: f64,
@@ -114,6 +118,13 @@ pub struct UpfitArgs {
 enum LossName {
     Demo,
     Paper,
+}
+
+/// An optimiser.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum OptimiserName {
+    Adam,
+    Soap,
 }
 
 impl UpfitArgs {
@@ -177,6 +188,10 @@ impl UpfitArgs {
         UpfitSettings {
             epochs: self.epochs,
             batch_size: self.batch_size as usize,
+            optimiser: match self.optimiser {
+                OptimiserName::Adam => Optimiser::Adam,
+                OptimiserName::Soap => Optimiser::Soap,
+            },
             loss,
             learning_rate: CosineDecay { first: self.learning_rate, last },
             seed: self.rng_seed,

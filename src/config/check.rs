@@ -254,9 +254,12 @@ fn check_python(config: &Config) -> Result<(), InvalidValue> {
 
 /// The steps between those that measure the norms save a gradient of models in Python, in walks that do not need the virial without bias.
 fn check_norm_interval(config: &Config) -> Result<(), InvalidValue> {
-    let interval = config.walk.bias_norm_interval.get();
+    let (interval, averaged) = (config.walk.bias_norm_interval.get(), config.walk.bias_averaging_steps.get());
     let expected = match interval {
         1 => return Ok(()),
+        _ if interval > averaged => {
+            "at most walk.bias_averaging_steps: the average would follow single steps"
+        }
         _ if config.potential.python.is_none() => {
             "1, or [potential.python]: for GRACE models calmwalk computes both gradients in one sweep"
         }

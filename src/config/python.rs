@@ -198,6 +198,8 @@ mod tests {
         assert!(read(1, "", "").is_ok() && read(1, python, barostat).is_ok());
         let error = read(5, "", "").unwrap_err();
         assert!(error.contains("walk.bias_norm_interval") && error.contains("[potential.python]"), "{error}");
+        let error = read(11, python, "").unwrap_err();
+        assert!(error.contains("at most walk.bias_averaging_steps"), "{error}");
         let error = read(5, python, barostat).unwrap_err();
         assert!(error.contains("walk.bias_norm_interval") && error.contains("walk.barostat"), "{error}");
     }

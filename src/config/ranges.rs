@@ -94,7 +94,7 @@ pub static RANGES: [Range; 133] = [
     range("walk.cell_bias.end_after_collected", "", [0.0, 1e9], [0.0, 1e4], ""),
     range("walk.cell_bias.end_after_contacts", "", [1.0, 1e9], [1.0, 1e3], ""),
     range("walk.bias_averaging_steps", "", [0.0, STEPS], [1.0, 1e3], ""),
-    range("walk.bias_norm_interval", "", [0.0, STEPS], [1.0, 100.0], ""),
+    range("walk.bias_norm_interval", "", [0.0, STEPS], [1.0, 10.0], ""),
     range("walk.trace_interval", "", [0.0, STEPS], [0.0, 1e5], ""),
     range("walk.trajectory_interval", "", [0.0, STEPS], [0.0, 1e5], ""),
     range("walk.skin", "Å", [0.0, 10.0], [0.05, 3.0], ""),

@@ -10,15 +10,15 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
-use crate::adam::AdamState;
 use crate::differences::FrameDifferences;
 use crate::energy_deviations::EnergyDeviations;
 use crate::energy_zero::EnergyZero;
 use crate::error::UpfitError;
+use crate::optimiser::OptimiserState;
 use crate::progress::{EpochRecord, ErrorsBySet};
 
 /// First line of a file. The number grows with each change of what follows, or of what a training makes of it.
-const FORMAT: &[u8] = b"calmwalk upfit checkpoint 3\n";
+const FORMAT: &[u8] = b"calmwalk upfit checkpoint 4\n";
 const HASH_BYTES: usize = blake3::OUT_LEN;
 
 /// The state is saved again once this many times the duration of the last time has passed: it costs at most 5 % of the time.
@@ -36,7 +36,7 @@ pub struct TrainingState {
     /// Their moving average.
     pub average: Option<Vec<f64>>,
     /// The optimiser.
-    pub adam: AdamState,
+    pub optimiser: OptimiserState,
     /// Differences in the finished batches of the epoch.
     pub running: FrameDifferences,
     /// The weights with the smallest validation loss.
@@ -157,6 +157,7 @@ impl CheckpointFile {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::adam::AdamState;
     use crate::loss::LossSettings;
 
     fn state() -> TrainingState {
@@ -168,7 +169,7 @@ mod tests {
             epoch: 3,
             batch: 7,
             average: Some(weights.clone()),
-            adam,
+            optimiser: OptimiserState::Adam(adam),
             running: FrameDifferences::default(),
             best: Some(BestWeights { epoch: 2, stage: 0, loss: 0.25, weights: weights.clone() }),
             weights,

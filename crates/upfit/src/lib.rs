@@ -1,4 +1,4 @@
-//! Fine-tunes the weights of a GRACE model on labelled structures: losses, Adam, epochs over threads, validation and
+//! Fine-tunes the weights of a GRACE model on labelled structures: losses, optimisers, epochs over threads, validation and
 //! checkpoints. The gradient with respect to the weights is `potentials::grace::TrainableGrace`'s.
 //!
 //! Results have the same bits for any number of threads and for any interruptions: every frame of a batch has its own
@@ -19,9 +19,11 @@ mod frozen;
 mod identity;
 mod learning_rate;
 mod loss;
+mod optimiser;
 mod prepared;
 mod progress;
 mod settings;
+mod soap;
 mod split;
 mod stop_request;
 #[cfg(test)]
@@ -36,6 +38,7 @@ pub use evaluation::{errors_of, zero_of_labels};
 pub use frame_fault::{FrameFault, MAX_ENERGY_DIFFERENCE, MAX_FORCE};
 pub use learning_rate::CosineDecay;
 pub use loss::{LossSettings, LossStage, LossWeights};
+pub use optimiser::Optimiser;
 pub use progress::{EpochRecord, ErrorsBySet, SetErrors, TrainingEvent, UpdateProgress};
 pub use settings::UpfitSettings;
 pub use split::split;

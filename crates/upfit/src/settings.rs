@@ -3,6 +3,7 @@
 use crate::error::UpfitError;
 use crate::learning_rate::CosineDecay;
 use crate::loss::LossSettings;
+use crate::optimiser::Optimiser;
 
 /// The settings of a training. All but the number of threads affect its result.
 #[derive(Clone, Debug, PartialEq)]
@@ -11,6 +12,8 @@ pub struct UpfitSettings {
     pub epochs: u64,
     /// Structures for each update; the last batch of an epoch may have fewer.
     pub batch_size: usize,
+    /// The optimiser.
+    pub optimiser: Optimiser,
     /// The loss.
     pub loss: LossSettings,
     /// Of the first update and of the last.
@@ -97,6 +100,7 @@ impl UpfitSettings {
             ("number of epochs", self.epochs.to_string()),
             ("batch size", self.batch_size.to_string()),
             ("loss (weights of energy, forces, stress)", stages.collect::<Vec<_>>().join(", ")),
+            ("optimiser", self.optimiser.name().to_owned()),
             ("Huber δ", self.loss.delta.to_string()),
             ("learning rate", self.learning_rate.first.to_string()),
             ("smallest learning rate", self.learning_rate.last.to_string()),

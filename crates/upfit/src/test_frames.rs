@@ -8,6 +8,7 @@ use potentials::grace::TrainableGrace;
 use crate::data::LabelledFrame;
 use crate::learning_rate::CosineDecay;
 use crate::loss::LossSettings;
+use crate::optimiser::Optimiser;
 use crate::settings::UpfitSettings;
 
 fn demonstration(name: &str) -> PathBuf {
@@ -48,6 +49,7 @@ pub fn settings() -> UpfitSettings {
     UpfitSettings {
         epochs: 2,
         batch_size: 2,
+        optimiser: Optimiser::Adam,
         loss,
         learning_rate: CosineDecay { first: 1e-4, last: 1e-5 },
         seed: 42,

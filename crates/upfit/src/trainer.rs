@@ -55,7 +55,7 @@ pub fn run(
         trainer.save(&state)?;
     }
     trainer.model.set_weights(&state.weights);
-    trainer.resumed_updates = state.adam.steps();
+    trainer.resumed_updates = state.optimiser.steps();
     let TrainingState { zero, spread, before, .. } = &state;
     on_event(TrainingEvent::Begun { resumed, zero, spread, before });
     while !stop() && !trainer.is_over(&state) {
@@ -159,14 +159,14 @@ impl<'a> Trainer<'a> {
     }
 
     fn updates_per_second(&self, state: &TrainingState) -> f64 {
-        let made = state.adam.steps() - self.resumed_updates;
+        let made = state.optimiser.steps() - self.resumed_updates;
         made as f64 / self.begun.elapsed().as_secs_f64().max(1e-9)
     }
 
     /// Expected time until the last epoch ends; `None` before this process has made an update.
     fn seconds_left(&self, state: &TrainingState) -> Option<f64> {
         let rate = Some(self.updates_per_second(state)).filter(|rate| *rate > 0.0)?;
-        Some(self.all_updates().saturating_sub(state.adam.steps()) as f64 / rate)
+        Some(self.all_updates().saturating_sub(state.optimiser.steps()) as f64 / rate)
     }
 
     fn progress(&self, state: &TrainingState, loss: f64) -> UpdateProgress {
@@ -174,11 +174,11 @@ impl<'a> Trainer<'a> {
         UpdateProgress {
             epoch: state.epoch + 1,
             epochs: self.settings.epochs,
-            updates: state.adam.steps(),
+            updates: state.optimiser.steps(),
             all_updates: self.all_updates(),
             updates_per_second: self.updates_per_second(state),
             seconds_left: self.seconds_left(state),
-            learning_rate: self.rate(state.adam.steps().saturating_sub(1)),
+            learning_rate: self.rate(state.optimiser.steps().saturating_sub(1)),
             loss,
             errors: state.running.errors(&weights),
         }

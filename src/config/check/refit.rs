@@ -210,7 +210,7 @@ mod tests {
         assert_eq!(errors(&with(REPLAY)), "");
         let native = "epochs = 5, batch_size = 4, learning_rate = 1e-4, min_learning_rate = 1e-4, loss = \"paper\", \
                       freeze = [\"shift\"], patience = 2, average = 0.99, validation_share = 0.2, energy_weight = 20.0, \
-                      force_weight = 100.0, stress_weight = 0.0, huber_delta = 0.02";
+                      force_weight = 100.0, stress_weight = 0.0, huber_delta = 0.02, optimiser = \"soap\"";
         let sets = "[[refit.test_sets]]\nname = \"liquid-1\"\nfile = \"l.extxyz\"\n[[refit.test_sets]]\nname = \"seeds\"\n\
                     file = \"s.extxyz\"";
         let all = format!(

@@ -45,8 +45,8 @@ impl Trainer<'_> {
         let loss = BatchLoss { delta: self.settings.loss.delta, weights };
         let found = batch_gradient(&self.model, &self.training, batch, &mut self.sums, &loss)?;
         self.check_finite(state, batch, &found)?;
-        let rate = self.rate(state.adam.steps());
-        state.adam.step(&mut state.weights, &found.gradient, rate, &self.frozen);
+        let rate = self.rate(state.optimiser.steps());
+        state.optimiser.step(&mut state.weights, &found.gradient, rate, &self.frozen);
         if let (Some(average), Some(decay)) = (&mut state.average, self.settings.average) {
             for (average, weight) in average.iter_mut().zip(&state.weights) {
                 *average = decay * *average + (1.0 - decay) * weight;
@@ -94,7 +94,7 @@ impl Trainer<'_> {
             state.best = Some(BestWeights { epoch, stage, loss: errors.loss, weights });
         }
         let errors = ErrorsBySet { training: state.running.errors(&weights), validation };
-        let learning_rate = self.rate(state.adam.steps().saturating_sub(1));
+        let learning_rate = self.rate(state.optimiser.steps().saturating_sub(1));
         let updates_per_second = self.updates_per_second(state);
         state.history.push(EpochRecord { epoch, stage, learning_rate, errors, updates_per_second });
         (state.epoch, state.batch, state.running) = (epoch, 0, FrameDifferences::default());

@@ -66,7 +66,7 @@ impl Trainer<'_> {
         UpfitOutcome {
             model: self.model,
             epoch,
-            updates: state.adam.steps(),
+            updates: state.optimiser.steps(),
             ended_early: state.epoch < self.settings.epochs,
             zero: state.zero,
             spread: state.spread,

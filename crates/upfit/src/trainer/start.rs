@@ -4,7 +4,6 @@ use analysis::LabelledEnergy;
 use atoms::composition;
 
 use super::Trainer;
-use crate::adam::AdamState;
 use crate::checkpoint::{BestWeights, TrainingState};
 use crate::differences::FrameDifferences;
 use crate::energy_deviations::EnergyDeviations;
@@ -58,7 +57,7 @@ impl<'a> Trainer<'a> {
             epoch: 0,
             batch: 0,
             average: self.settings.average.map(|_| weights.clone()),
-            adam: AdamState::new(weights.len()),
+            optimiser: self.settings.optimiser.start(self.model.groups()),
             running: FrameDifferences::default(),
             best,
             weights,

@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize};
 use super::*;
 use crate::learning_rate::CosineDecay;
 use crate::loss::LossSettings;
+use crate::optimiser::Optimiser;
 use crate::progress::ErrorsBySet;
 use crate::split::split;
 use crate::test_frames::{aluminium, model, settings, stronger};
@@ -44,7 +45,13 @@ fn the_loss_falls_and_threads_change_no_bit() {
 
 #[test]
 fn a_training_that_is_stopped_anywhere_goes_on_to_the_same_bits() {
-    let (data, settings) = (data(), UpfitSettings { average: Some(0.5), ..settings() });
+    for optimiser in [Optimiser::Adam, Optimiser::Soap] {
+        stopped_anywhere(UpfitSettings { average: Some(0.5), optimiser, ..settings() });
+    }
+}
+
+fn stopped_anywhere(settings: UpfitSettings) {
+    let data = data();
     let whole = train(&data, &settings);
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("run.upfit");
@@ -70,6 +77,7 @@ fn a_training_that_is_stopped_anywhere_goes_on_to_the_same_bits() {
     for (data, settings, difference) in [
         (data.clone(), UpfitSettings { seed: 7, ..settings.clone() }, "its random seed is 42, now it is 7"),
         (split(aluminium(5), 0.2, 1).unwrap(), settings.clone(), "its training set"),
+        (data.clone(), other_optimiser(&settings), "its optimiser"),
     ] {
         match run(model(), &data, &settings, Some(&path), &|| false, |_| {}) {
             Err(error @ UpfitError::OtherTraining { .. }) => {
@@ -77,6 +85,28 @@ fn a_training_that_is_stopped_anywhere_goes_on_to_the_same_bits() {
             }
             _ => panic!("a checkpoint of another training was accepted"),
         }
+    }
+}
+
+fn other_optimiser(settings: &UpfitSettings) -> UpfitSettings {
+    let optimiser = if settings.optimiser == Optimiser::Adam { Optimiser::Soap } else { Optimiser::Adam };
+    UpfitSettings { optimiser, ..settings.clone() }
+}
+
+#[test]
+fn soap_lowers_the_loss_and_keeps_frozen_weights() {
+    let frozen = vec!["energy_mlp".to_owned()];
+    let learning_rate = CosineDecay { first: 1e-2, last: 1e-4 };
+    let trained = train(
+        &data(),
+        &UpfitSettings { epochs: 4, optimiser: Optimiser::Soap, learning_rate, frozen, ..settings() },
+    );
+    assert!(trained.after.training.loss < 0.5 * trained.before.training.loss, "{:?}", trained.after);
+    let begin = model();
+    for group in begin.groups() {
+        let is_frozen = group.name.starts_with("energy_mlp");
+        let [now, before] = [&trained.model, &begin].map(|model| &model.weights()[group.range.clone()]);
+        assert_eq!(now == before, is_frozen, "{}", group.name);
     }
 }
 

@@ -1,0 +1,67 @@
+//! The optimisers of a training.
+
+use potentials::grace::WeightGroup;
+use serde::{Deserialize, Serialize};
+
+use crate::adam::AdamState;
+use crate::soap::SoapState;
+
+/// How gradients become steps.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Optimiser {
+    /// Adam with AMSGrad.
+    #[default]
+    Adam,
+    /// Adam in the eigenbases of Shampoo's preconditioners.
+    Soap,
+}
+
+/// The state of an optimiser.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum OptimiserState {
+    /// Of [`Optimiser::Adam`].
+    Adam(AdamState),
+    /// Of [`Optimiser::Soap`].
+    Soap(SoapState),
+}
+
+impl Optimiser {
+    /// Its name on the command line and in configurations.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Adam => "adam",
+            Self::Soap => "soap",
+        }
+    }
+
+    /// Its state before the first step of the weights of these groups.
+    pub fn start(self, groups: &[WeightGroup]) -> OptimiserState {
+        match self {
+            Self::Adam => {
+                OptimiserState::Adam(AdamState::new(groups.last().map_or(0, |group| group.range.end)))
+            }
+            Self::Soap => OptimiserState::Soap(SoapState::new(groups)),
+        }
+    }
+}
+
+impl OptimiserState {
+    /// Number of steps made.
+    pub fn steps(&self) -> u64 {
+        match self {
+            Self::Adam(state) => state.steps(),
+            Self::Soap(state) => state.steps(),
+        }
+    }
+
+    /// Changes the weights that are not frozen.
+    ///
+    /// # Panics
+    /// If a list has another length than that of the weights of the groups.
+    pub fn step(&mut self, weights: &mut [f64], gradient: &[f64], rate: f64, frozen: &[bool]) {
+        match self {
+            Self::Adam(state) => state.step(weights, gradient, rate, frozen),
+            Self::Soap(state) => state.step(weights, gradient, rate, frozen),
+        }
+    }
+}
