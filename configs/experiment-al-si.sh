@@ -2,7 +2,7 @@
 # One replicate of the collection experiment in aluminium or silicon: the paper's biased and unbiased collections, upfits with the same
 # command, and their errors on sets made here. docs/experiment-al-si.md explains the steps.
 # Usage: configs/experiment-al-si.sh al|si REPLICATE DIRECTORY [CALMWALK]
-# REPLICATE, a number above 0, is the random seed of everything. EPOCHS=400 is the paper's. THREADS=1 is right where as many of these as
+# REPLICATE, a number above 0, is the random seed of everything. EPOCHS is 40 if it is not set. THREADS=1 is right where as many of these as
 # there are cores run beside each other.
 set -eu
 element=$1 replicate=$2
@@ -10,7 +10,7 @@ mkdir -p "$3"
 out=$(cd "$3" && pwd)
 program=${4:-calmwalk}
 configs=$(cd "$(dirname "$0")" && pwd)
-epochs=${EPOCHS:-100} threads=${THREADS:-2}
+epochs=${EPOCHS:-40} threads=${THREADS:-2}
 case $element in
 al) model=al_eam_1l kind=eam_fs potential=Al_mm.eam.fs temperatures="300 500 700 850 1000 1100" liquid=1200 melt=3000
     seeds=aluminium_seeds.extxyz defects=700 ;;
@@ -106,7 +106,7 @@ done
 for collection in unbiased control biased; do
     [ -e "$out/upfit-$collection.npz" ] && continue
     "$program" upfit --model "$data/$model/kokkos.npz" "$data/$model/seed_frames.extxyz" "$out/$collection.extxyz" \
-        --validation-share 0 --epochs "$epochs" --threads "$threads" --rng-seed "$replicate" --output "$out/upfit-$collection.npz"
+        --validation-share 0 --optimiser soap --learning-rate 0.05 --epochs "$epochs" --threads "$threads" --rng-seed "$replicate" --output "$out/upfit-$collection.npz"
     "$program" calm build --model "$out/upfit-$collection.npz" "$data/$model/seed_frames.extxyz" "$out/$collection.extxyz" \
         --candidates 1 --output "$out/mixture-$collection.npz"
 done
