@@ -10,7 +10,7 @@ use store::{AssignmentRecord, Store, StoredCandidate, WalkRecord};
 use tempfile::TempDir;
 use wire::{ContentHash, Origin};
 
-use crate::common::campaign::Small;
+use crate::common::campaign::{Small, written};
 use crate::common::processes::{signal, wait_until};
 use crate::common::{Running, calmwalk, program, refuse, stderr, succeed};
 
@@ -39,18 +39,6 @@ fn recorded(directory: &Path) -> Recorded {
 fn finished(small: &Small, changes: &[(&str, &str)]) -> TempDir {
     let directory = written(small, changes);
     succeed(directory.path(), RUN);
-    directory
-}
-
-fn written(small: &Small, changes: &[(&str, &str)]) -> TempDir {
-    let directory = tempfile::tempdir().unwrap();
-    let path = small.write(directory.path());
-    let mut text = fs::read_to_string(&path).unwrap();
-    for (from, to) in changes {
-        assert!(text.contains(from), "no {from}");
-        text = text.replacen(from, to, 1);
-    }
-    fs::write(path, text).unwrap();
     directory
 }
 

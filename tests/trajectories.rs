@@ -5,26 +5,12 @@ use std::path::Path;
 use std::process::Stdio;
 
 use atoms::extxyz::Frame;
-use tempfile::TempDir;
 
-use crate::common::campaign::{Counters, Small, TRAJECTORY_INTERVAL};
+use crate::common::campaign::{Counters, Small, TRAJECTORY_INTERVAL, written};
 use crate::common::processes::{signal, wait_until};
 use crate::common::{Running, calmwalk, program, refuse, succeed};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "here"];
-
-/// A campaign with other keys, by what they replace.
-fn written(small: &Small, changes: &[(&str, &str)]) -> TempDir {
-    let directory = tempfile::tempdir().unwrap();
-    let path = small.write(directory.path());
-    let mut text = fs::read_to_string(&path).unwrap();
-    for (from, to) in changes {
-        assert!(text.contains(from), "no {from}");
-        text = text.replacen(from, to, 1);
-    }
-    fs::write(path, text).unwrap();
-    directory
-}
 
 /// Numbers of the walks that made a step.
 fn walks(here: &Path) -> Vec<u64> {

@@ -10,6 +10,7 @@ mod report;
 use std::path::{Path, PathBuf};
 
 use ::upfit::{CosineDecay, LossSettings, Optimiser, UpfitSettings};
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 
 use self::display::TrainingDisplay;
 use self::fine_tuning::{FineTuned, FineTuning, fine_tune};
@@ -76,8 +77,8 @@ pub struct UpfitArgs {
     weight: Vec<(PathBuf, f64)>,
     /// Optimiser. adam: Adam with AMSGrad, as gracemaker has it; soap: Adam in the eigenbases of Shampoo's preconditioners, which needs fewer
     /// epochs (docs/upfit.md); start with --learning-rate 0.01
-    #[arg(long, value_name = "NAME", value_enum, default_value_t = OptimiserName::Adam)]
-    optimiser: OptimiserName,
+    #[arg(long, value_name = "NAME", default_value = Optimiser::default().name(), value_parser = optimisers())]
+    optimiser: Optimiser,
     /// Learning rate of the first update; it falls by half a cosine
     #[arg(long, value_name = "RATE", default_value_t = 1e-3, value_parser = positive)]
     learning_rate: f64,
@@ -118,13 +119,6 @@ pub struct UpfitArgs {
 enum LossName {
     Demo,
     Paper,
-}
-
-/// An optimiser.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum OptimiserName {
-    Adam,
-    Soap,
 }
 
 impl UpfitArgs {
@@ -188,10 +182,7 @@ impl UpfitArgs {
         UpfitSettings {
             epochs: self.epochs,
             batch_size: self.batch_size as usize,
-            optimiser: match self.optimiser {
-                OptimiserName::Adam => Optimiser::Adam,
-                OptimiserName::Soap => Optimiser::Soap,
-            },
+            optimiser: self.optimiser,
             loss,
             learning_rate: CosineDecay { first: self.learning_rate, last },
             seed: self.rng_seed,
@@ -201,6 +192,13 @@ impl UpfitArgs {
             threads: self.threads.map_or(cores, usize::from),
         }
     }
+}
+
+/// The optimisers by their names.
+fn optimisers() -> impl TypedValueParser<Value = Optimiser> {
+    let named = |name: String| Optimiser::ALL.into_iter().find(|optimiser| optimiser.name() == name);
+    PossibleValuesParser::new(Optimiser::ALL.map(Optimiser::name))
+        .try_map(move |name| named(name).ok_or("not an optimiser"))
 }
 
 fn stopped_text(checkpoint: &Path) -> String {

@@ -7,6 +7,7 @@ use calm::rules::Positive;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use toml::Spanned;
+use upfit::Optimiser;
 
 use super::defaults;
 use crate::duration::Duration;
@@ -108,8 +109,7 @@ pub struct NativeRefit {
     /// Number of structures for each update.
     pub batch_size: NonZeroU32,
     /// What turns gradients into steps.
-    #[serde(skip_serializing_if = "RefitOptimiser::is_default")]
-    pub optimiser: RefitOptimiser,
+    pub optimiser: Optimiser,
     /// Learning rate of the first update; it falls by half a cosine.
     pub learning_rate: Positive,
     /// Learning rate of the last update, at most `learning_rate`. Default: a hundredth of it.
@@ -157,24 +157,6 @@ pub enum RefitLoss {
     Demo,
     /// Energy 1, forces 5, stress 0.1; after 5/12 of the epochs 25, 1 and 0.1.
     Paper,
-}
-
-/// An optimiser, as `calmwalk upfit --optimiser`.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum RefitOptimiser {
-    /// Adam with AMSGrad.
-    #[default]
-    Adam,
-    /// Adam in the eigenbases of Shampoo's preconditioners.
-    Soap,
-}
-
-impl RefitOptimiser {
-    /// Campaigns that began before the key existed have none.
-    fn is_default(&self) -> bool {
-        *self == Self::default()
-    }
 }
 
 /// Settings of the training by a program.
@@ -238,7 +220,7 @@ impl Default for NativeRefit {
         Self {
             epochs: defaults::nonzero(100).into(),
             batch_size: defaults::nonzero(8),
-            optimiser: RefitOptimiser::default(),
+            optimiser: Optimiser::default(),
             learning_rate: defaults::positive(1e-3),
             min_learning_rate: None,
             loss: RefitLoss::default(),

@@ -6,13 +6,13 @@ use std::time::{Duration, Instant};
 use potentials::grace::TrainableGrace;
 use tokio_util::sync::CancellationToken;
 use upfit::{
-    CosineDecay, EnergyDeviations, EnergyZero, FarStructure, LossSettings, Optimiser, SetErrors,
-    TrainingData, TrainingEvent, UpfitSettings,
+    CosineDecay, EnergyDeviations, EnergyZero, FarStructure, LossSettings, SetErrors, TrainingData,
+    TrainingEvent, UpfitSettings,
 };
 
 use super::failure::RefitFailure;
 use super::settings::RefitSettings;
-use crate::config::{NativeRefit, RefitLoss, RefitOptimiser};
+use crate::config::{NativeRefit, RefitLoss};
 use crate::exit_status::CommandError;
 use crate::labelled_frames::{DataFile, read_frames};
 use crate::process_config::HashedFile;
@@ -185,10 +185,7 @@ fn upfit_settings(native: &NativeRefit, seed: u64, threads: usize) -> UpfitSetti
     UpfitSettings {
         epochs: native.epochs.get(),
         batch_size: native.batch_size.get() as usize,
-        optimiser: match native.optimiser {
-            RefitOptimiser::Adam => Optimiser::Adam,
-            RefitOptimiser::Soap => Optimiser::Soap,
-        },
+        optimiser: native.optimiser,
         loss,
         learning_rate: CosineDecay { first, last: native.min_learning_rate.unwrap_or(0.01 * first) },
         seed,

@@ -5,6 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use store::{ComponentRecord, ExportFilter, Location, Store, VersionRecord};
+use tempfile::TempDir;
 use wire::{TracePoint, WalkFrame, WalkId};
 
 use super::config;
@@ -245,4 +246,17 @@ async fn check_consistency(store: &Store) {
     let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
     let rows = store.labelled(&filter, None, u32::MAX).await.expect("labels");
     assert_eq!(rows.len(), kinds("accepted") + kinds("control"));
+}
+
+/// A campaign in a directory of its own with other keys, by what they replace.
+pub fn written(small: &Small, changes: &[(&str, &str)]) -> TempDir {
+    let directory = tempfile::tempdir().unwrap();
+    let path = small.write(directory.path());
+    let mut text = fs::read_to_string(&path).unwrap();
+    for (from, to) in changes {
+        assert!(text.contains(from), "no {from}");
+        text = text.replacen(from, to, 1);
+    }
+    fs::write(path, text).unwrap();
+    directory
 }

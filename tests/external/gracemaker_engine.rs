@@ -10,7 +10,7 @@ use atoms::{Evaluation, NeighbourList, Species, Structure, read_extxyz};
 use bridge::{Device, PythonModel, PythonSettings};
 use calm::{Artifact, Grades, Mixture};
 use potentials::ModelWithFeatures;
-use potentials::grace::{GraceModel, GraceProjection, PullBack, Threads};
+use potentials::grace::{GraceModel, PullBack, Threads};
 use tokio_util::sync::CancellationToken;
 
 use crate::common::{config, deviation, stderr, succeed, write_frames};
@@ -35,7 +35,7 @@ fn make(here: &Path, kind: &str) {
     assert!(made.status.success(), "{}", stderr(&made));
 }
 
-/// Frames of the demonstration, with every fifth atom copper in half of them, and a mixture for `kind` of all.
+/// Frames of the demonstration, with every fifth atom copper in half of them, and a mixture for `kind` of all, which `graded.npz` has with the model.
 fn make_mixture(here: &Path, kind: &str) -> Artifact {
     let copper: Species = "Cu".parse().unwrap();
     let mut frames = read_extxyz(&config("data/al_eam_1l/seed_frames.extxyz")).unwrap();
@@ -55,6 +55,8 @@ fn make_mixture(here: &Path, kind: &str) -> Artifact {
         "16",
         "--output",
         "calm.npz",
+        "--embed",
+        "graded.npz",
     ];
     succeed(here, build.into_iter().chain(["--model", &format!("{kind}/kokkos.npz")]));
     Artifact::load(here.join("calm.npz")).unwrap()
@@ -93,18 +95,8 @@ fn a_biased_step_is_that_of_gracemaker() {
         let here = directory.path();
         make(here, kind);
         let Artifact { mixture, projection, .. } = make_mixture(here, kind);
-        let native = GraceModel::load(&here.join(kind).join("kokkos.npz")).unwrap();
-        let layers = native.description().architecture.layers();
-        let native = native.with_projection(GraceProjection {
-            matrix: projection.matrix.clone(),
-            dimension: projection.columns,
-            normalize: projection.normalised,
-            density_channels: projection.density_channels,
-            density_scale: projection.density_scale,
-            asinh: projection.asinh,
-            layers,
-        });
-        let native: Arc<dyn ModelWithFeatures> = Arc::new(native.unwrap());
+        let native: Arc<dyn ModelWithFeatures> =
+            Arc::new(GraceModel::load(&here.join("graded.npz")).unwrap());
         let settings = PythonSettings::new(&gracemaker(), "gracemaker", Some(&here.join(kind)));
         let device = Device::start(settings, true, &CancellationToken::new(), |_| {}).map(Arc::new).unwrap();
         let python = PythonModel::local(vec![device]).unwrap().projected(projection).unwrap();

@@ -98,19 +98,7 @@ fn faults_of_the_server_change_nothing() {
     fs::write(here.join("campaign.toml"), text.replace(&usual, &format!("biased_steps = {steps}"))).unwrap();
     succeed(here, ["run", "campaign.toml", "--directory", "plain", "--in-process"]);
     fs::remove_file(&count).unwrap();
-    let mut run =
-        Running(program(here).args(["run", "campaign.toml", "--directory", "disturbed"]).spawn().unwrap());
-    let (mut faults, mut last) = (0, 100);
-    while run.0.try_wait().unwrap().is_none() {
-        sleep(Duration::from_millis(20));
-        let calls = fs::read_to_string(&count).map_or(0, |text| text.lines().count());
-        // Three failures without a result in between would end the walks.
-        let begun = calls > last + CALLS_BETWEEN;
-        if begun && disturb(here, faults) {
-            (faults, last) = (faults + 1, calls);
-        }
-    }
-    assert!(run.0.wait().unwrap().success());
+    let faults = run_disturbed(here, &count, |number| disturb(here, number));
     assert!(faults >= wanted, "the campaign was over after {faults} faults");
     let (plain, disturbed) = (export(here, "plain"), export(here, "disturbed"));
     assert!(plain == disturbed, "{} and {} bytes", plain.len(), disturbed.len());
@@ -144,19 +132,13 @@ fn one_gradient_for_forces_and_bias_gives_a_campaign() {
     fs::remove_file(&count).unwrap();
     let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
     fs::write(here.join("campaign.toml"), text.replace("trace_interval = 35", "trace_interval = 9")).unwrap();
-    let mut run =
-        Running(program(here).args(["run", "campaign.toml", "--directory", "disturbed"]).spawn().unwrap());
-    let (mut faults, mut last) = (0, 100);
-    while run.0.try_wait().unwrap().is_none() {
-        sleep(Duration::from_millis(20));
-        let calls = fs::read_to_string(&count).map_or(0, |text| text.lines().count());
-        if faults < 3 && calls > last + CALLS_BETWEEN {
-            fs::write(here.join("control.part"), ["exit", "nan", "memory"][faults]).unwrap();
-            fs::rename(here.join("control.part"), &control).unwrap();
-            (faults, last) = (faults + 1, calls);
-        }
-    }
-    assert!(run.0.wait().unwrap().success() && faults == 3);
+    let faults = run_disturbed(here, &count, |number| {
+        let Some(fault) = ["exit", "nan", "memory"].get(number as usize) else { return false };
+        fs::write(here.join("control.part"), fault).unwrap();
+        fs::rename(here.join("control.part"), &control).unwrap();
+        true
+    });
+    assert_eq!(faults, 3);
     let plain = export(here, "plain");
     assert!(plain == export(here, "disturbed") && plain.matches("origin=biased").count() > 2, "{plain}");
     write(6);
@@ -191,6 +173,24 @@ fn several_devices_change_nothing() {
     let status = succeed(here, ["status", "--all", "two"]);
     assert!(status.contains("simulated on simulated:0, simulated:1: busy"), "{status}");
     assert!(status.contains("simulated on simulated:1: busy"), "{status}");
+}
+
+/// Runs the campaign into the directory `disturbed`. Between calls of the server, `disturb` may make a fault, whose number it gets. Returns the
+/// number of faults.
+fn run_disturbed(here: &Path, count: &Path, mut disturb: impl FnMut(u32) -> bool) -> u32 {
+    let mut run =
+        Running(program(here).args(["run", "campaign.toml", "--directory", "disturbed"]).spawn().unwrap());
+    let (mut faults, mut last) = (0, 100);
+    while run.0.try_wait().unwrap().is_none() {
+        sleep(Duration::from_millis(20));
+        let calls = fs::read_to_string(count).map_or(0, |text| text.lines().count());
+        // Three failures without a result in between would end the walks.
+        if calls > last + CALLS_BETWEEN && disturb(faults) {
+            (faults, last) = (faults + 1, calls);
+        }
+    }
+    assert!(run.0.wait().unwrap().success());
+    faults
 }
 
 /// One fault of the server of the campaign in this directory. Returns whether there was one.

@@ -1,13 +1,15 @@
 //! The optimisers of a training.
 
 use potentials::grace::WeightGroup;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::adam::AdamState;
 use crate::soap::SoapState;
 
 /// How gradients become steps.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
 pub enum Optimiser {
     /// Adam with AMSGrad.
     #[default]
@@ -26,6 +28,9 @@ pub enum OptimiserState {
 }
 
 impl Optimiser {
+    /// All.
+    pub const ALL: [Self; 2] = [Self::Adam, Self::Soap];
+
     /// Its name on the command line and in configurations.
     pub fn name(self) -> &'static str {
         match self {

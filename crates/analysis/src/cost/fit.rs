@@ -2,7 +2,7 @@
 
 use super::{EXPONENT_PRIORS, GUESS_SIGMA, PRIOR_NOISE_SCALE};
 
-type Covariance3 = [[f64; 3]; 3];
+type Matrix3x3 = [[f64; 3]; 3];
 
 /// (1, ln x, ln k) and the logarithm of the cost.
 pub(super) type CostPoint = ([f64; 3], f64);
@@ -17,7 +17,7 @@ pub(super) struct Normal {
 #[derive(Clone, Debug)]
 pub(super) struct Fit {
     pub coefficients: [f64; 3],
-    covariance: Covariance3,
+    covariance: Matrix3x3,
     /// Scale of the noise.
     pub scale: f64,
     /// Mean / median of the cost: noise in the logarithm raises the mean.
@@ -98,7 +98,7 @@ fn solve(
     weights: &[f64],
     scale: f64,
     guess: Option<CostPoint>,
-) -> Option<([f64; 3], Covariance3)> {
+) -> Option<([f64; 3], Matrix3x3)> {
     let (mut precision, mut right) = ([[0.0; 3]; 3], [0.0; 3]);
     for (k, prior) in EXPONENT_PRIORS.iter().enumerate() {
         precision[k + 1][k + 1] = prior.sd.powi(-2);
@@ -118,7 +118,7 @@ fn solve(
 }
 
 /// Inverse of a symmetric matrix by cofactors.
-fn inverse(m: &Covariance3) -> Option<Covariance3> {
+fn inverse(m: &Matrix3x3) -> Option<Matrix3x3> {
     let cofactor = |i: usize, k: usize| {
         let ([a, b], [c, d]) = ([(i + 1) % 3, (i + 2) % 3], [(k + 1) % 3, (k + 2) % 3]);
         m[a][c] * m[b][d] - m[a][d] * m[b][c]
