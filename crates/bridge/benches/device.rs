@@ -2,8 +2,9 @@
 //!
 //! `CALMWALK_PYTHON=…/python cargo bench -p bridge --bench device`
 //!
-//! With `CALMWALK_MODEL` (a file for the adapter named by `CALMWALK_ADAPTER`) and `CALMWALK_DEVICE`, for instance `cuda`, the second
-//! table is that of a real model: 64 walkers with 108 atoms of aluminium, single calls against batches.
+//! With `CALMWALK_MODEL` (a file for the adapter named by `CALMWALK_ADAPTER`), further tables are those of a real model: walkers with 108
+//! atoms of aluminium, single calls against batches, with two gradients a step and with one (`walk.bias_norm_interval = 10`).
+//! `CALMWALK_DEVICE` (cpu), `CALMWALK_PRECISION` (double), `CALMWALK_WALKERS` (64) and `CALMWALK_SECONDS` (20, of each line) say how.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,7 +13,7 @@ use std::time::{Duration, Instant};
 use atoms::{Cell, Evaluation, NeighbourList, Species, Structure};
 use bridge::{Device, DeviceService, PythonModel, PythonSettings};
 use calm::build::random_projection;
-use potentials::grace::{PullBack, Threads};
+use potentials::grace::{Precision, PullBack, Threads};
 use potentials::{ModelWithFeatures, PotentialWithFeatures};
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
@@ -28,12 +29,33 @@ fn main() {
     if let (Some(model), Ok(adapter)) =
         (std::env::var_os("CALMWALK_MODEL"), std::env::var("CALMWALK_ADAPTER"))
     {
-        let mut settings = PythonSettings::new(&python, &adapter, Some(Path::new(&model)));
-        settings.device = std::env::var("CALMWALK_DEVICE").unwrap_or_else(|_| "cpu".to_owned());
-        println!("\n{adapter} on {}, biased steps of 108 atoms", settings.device);
-        let walkers = std::env::var("CALMWALK_WALKERS").ok().and_then(|text| text.parse().ok()).unwrap_or(64);
-        compare(&settings, walkers, 3, Duration::from_secs(20));
+        real(PythonSettings::new(&python, &adapter, Some(Path::new(&model))));
     }
+}
+
+/// The variable `name` of the environment, or `default`.
+fn variable<T: std::str::FromStr>(name: &str, default: T) -> T {
+    let Ok(text) = std::env::var(name) else { return default };
+    text.parse().unwrap_or_else(|_| panic!("{name}={text} cannot be read"))
+}
+
+/// A real model.
+fn real(mut settings: PythonSettings) {
+    settings.device = variable("CALMWALK_DEVICE", "cpu".to_owned());
+    settings.precision = match variable("CALMWALK_PRECISION", "double".to_owned()).as_str() {
+        "single" => Precision::Single,
+        "double" => Precision::Double,
+        other => panic!("CALMWALK_PRECISION={other}, expected single or double"),
+    };
+    let (walkers, time) =
+        (variable("CALMWALK_WALKERS", 64), Duration::from_secs(variable("CALMWALK_SECONDS", 20)));
+    println!(
+        "\n{} on {}, {:?}, biased steps of 108 atoms",
+        settings.adapter, settings.device, settings.precision
+    );
+    compare(&settings, 3, &Walkers { number: walkers, norm_interval: 1, time });
+    println!("\nthe same, with one gradient for forces and bias in 9 steps of 10");
+    compare(&settings, 3, &Walkers { number: walkers, norm_interval: 10, time });
 }
 
 fn radial(python: &Path, adapter: &str) -> PythonSettings {
@@ -87,16 +109,27 @@ fn simulated(python: &Path) {
     let mut settings = radial(python, "simulated");
     settings.options = json!({ "base_seconds": 0.02 }).as_object().cloned().unwrap_or_default();
     println!("\nsimulated device, 20 ms a batch, biased steps of 32 atoms");
-    compare(&settings, 64, 2, Duration::from_secs(8));
+    let walkers = Walkers { number: 64, norm_interval: 1, time: Duration::from_secs(8) };
+    compare(&settings, 2, &walkers);
 }
 
-/// Biased steps a second of this many walkers, with single calls and with batches.
-fn compare(settings: &PythonSettings, walkers: usize, repeats: usize, time: Duration) {
+/// Walkers that take biased steps for some time.
+struct Walkers {
+    number: usize,
+    /// Steps from one with two gradients to the next.
+    norm_interval: usize,
+    time: Duration,
+}
+
+/// Biased steps a second of these walkers, with single calls and with batches.
+fn compare(settings: &PythonSettings, repeats: usize, walkers: &Walkers) {
+    let (time, norm_interval, walkers) = (walkers.time, walkers.norm_interval, walkers.number);
     println!("walkers  max_batch  steps/s  ratio  mean batch  device busy  wait, ms");
     let mut first = None;
     for max_batch in [1, 8, 32, 64] {
         let mut settings = settings.clone();
         settings.max_batch = max_batch.try_into().expect("above zero");
+        settings.combined_gradients = norm_interval > 1;
         let device = start(settings);
         let model = projected(PythonModel::local(vec![Arc::clone(&device)]).expect("a model"));
         let _ = device.warm_up(&crystal(repeats, 0), 0.5, walkers);
@@ -104,15 +137,19 @@ fn compare(settings: &PythonSettings, walkers: usize, repeats: usize, time: Dura
         let end = Instant::now() + time;
         let begun = Instant::now();
         let steps: u64 = std::thread::scope(|scope| {
-            let run = |_| {
+            let run = |walker: usize| {
                 let model = Arc::clone(&model);
                 scope.spawn(move || {
                     let (mut step, mut steps) = (BiasedStep::new(&model, repeats), 0);
                     while Instant::now() < end {
-                        step.run();
+                        if (walker + steps).is_multiple_of(norm_interval) {
+                            step.run()
+                        } else {
+                            step.run_combined()
+                        }
                         steps += 1;
                     }
-                    steps
+                    steps as u64
                 })
             };
             let all: Vec<_> = (0..walkers).map(run).collect();
@@ -154,6 +191,13 @@ impl BiasedStep {
         let grade = |_: &[u32], features: &[f64], out: &mut [f64]| out.copy_from_slice(features);
         let Self { potential, structure, list, energy, pull_back } = self;
         potential.evaluate_graded(structure, list, &grade, energy, Some(pull_back)).expect("a result");
+    }
+
+    /// With one gradient for energy and features.
+    fn run_combined(&mut self) {
+        let grade = |_: &[u32], features: &[f64], out: &mut [f64]| out.copy_from_slice(features);
+        let Self { potential, structure, list, energy, .. } = self;
+        potential.evaluate_combined(structure, list, &grade, energy).expect("a result");
     }
 }
 
