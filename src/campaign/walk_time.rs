@@ -58,6 +58,8 @@ impl StepTimes {
         // Only the bias of the walk differs from that of its control walk, and the volume is that of the seed structure.
         (settings.equilibration_steps, settings.biased_steps) = (0, u64::MAX);
         settings.trajectory_interval = 0;
+        // Steps that measure the norms of the bias no oftener than those of a walk do.
+        settings.bias_averaging_steps = 1;
         let mixture = Arc::new(campaign.artifact.mixture.clone());
         let (model, settings, original) = (campaign.model.shared(), Arc::new(settings), Arc::clone(&mixture));
         let context = WalkContext { model, threads, settings, original };

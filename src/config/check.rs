@@ -263,12 +263,23 @@ fn check_norm_interval(config: &Config) -> Result<(), InvalidValue> {
         _ if config.potential.python.is_none() => {
             "1, or [potential.python]: for GRACE models calmwalk computes both gradients in one sweep"
         }
-        _ if config.walk.barostat.is_some() && config.walks.is_empty() => {
+        _ if all_at_constant_pressure(config) => {
             "1, or no walk.barostat: at constant pressure each step needs the virial without bias"
         }
         _ => return Ok(()),
     };
     wrong("walk.bias_norm_interval", interval, expected)
+}
+
+fn all_at_constant_pressure(config: &Config) -> bool {
+    let barostat = config.walk.barostat.is_some();
+    if config.walks.is_empty() {
+        return barostat;
+    }
+    config
+        .walks
+        .iter()
+        .all(|group| group.volume_ramps.is_empty() && (barostat || !group.pressures.is_empty()))
 }
 
 fn check_thermostat(config: &Config) -> Result<(), InvalidValue> {

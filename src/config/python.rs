@@ -202,6 +202,10 @@ mod tests {
         assert!(error.contains("at most walk.bias_averaging_steps"), "{error}");
         let error = read(5, python, barostat).unwrap_err();
         assert!(error.contains("walk.bias_norm_interval") && error.contains("walk.barostat"), "{error}");
+        let group = |cell: &str| format!("{python}\n[[walks]]\nname = \"a\"\n{cell}\n");
+        let error = read(5, &group("pressures = [1.0]"), "").unwrap_err();
+        assert!(error.contains("walk.bias_norm_interval") && error.contains("walk.barostat"), "{error}");
+        assert!(read(5, &group("volume_ramps = [{ from = 1.0, to = 1.1 }]"), "").is_ok());
     }
 
     #[test]

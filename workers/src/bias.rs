@@ -39,11 +39,15 @@ pub struct BiasState {
 
 impl BiasState {
     /// Evaluations since the norms were last measured, if the next one measures them, with `interval` evaluations from one to the next;
-    /// `None` if it does not. While the averages settle, all do.
+    /// `None` if it does not. While the averages settle, all do, and so does the first with a bias. The last of each `interval` with a bias
+    /// does: at the usual intervals, points of the trace then need no evaluation of their own.
     fn measures_after(&self, steps: u64, interval: u64) -> Option<u64> {
+        let interval = interval.max(1);
         match self.evaluations.checked_sub(steps) {
             None | Some(0) => Some(1),
-            Some(biased) => biased.is_multiple_of(interval.max(1)).then_some(interval.max(1)),
+            Some(biased) if !(biased + 1).is_multiple_of(interval) => None,
+            // Since the first with a bias, or since the last of the interval before.
+            Some(biased) => Some(interval.min(biased)),
         }
     }
 
@@ -198,11 +202,13 @@ impl BiasedPotential {
 
     /// Energy, forces and virial of the potential alone at the last evaluation.
     pub fn physical(&self) -> &Evaluation {
+        debug_assert!(!self.is_combined, "forces and bias are not apart");
         &self.physical
     }
 
     /// τ_r ∂𝒰/∂ε as far as it is in the virial of the last evaluation, eV; known as [`BiasedPotential::physical`] is.
     pub fn bias_virial(&self) -> &Matrix3 {
+        debug_assert!(!self.is_combined, "forces and bias are not apart");
         &self.bias_virial
     }
 
@@ -211,8 +217,9 @@ impl BiasedPotential {
         self.measured_after
     }
 
-    /// ∂𝒰/∂ε at the last evaluation with the bias on, symmetric.
+    /// ∂𝒰/∂ε at the last evaluation with the bias on, symmetric; known as [`BiasedPotential::physical`] is.
     pub fn strain_derivative(&self) -> &Matrix3 {
+        debug_assert!(!self.is_combined, "forces and bias are not apart");
         &self.pull_back.virial
     }
 
@@ -229,8 +236,9 @@ impl BiasedPotential {
         self.scale
     }
 
-    /// Σ‖τ_r ∇𝒰‖ / Σ‖F^phys‖ at the last evaluation; 0 without bias, and without forces.
+    /// Σ‖τ_r ∇𝒰‖ / Σ‖F^phys‖ at the last evaluation; 0 without bias, and without forces. Known as [`BiasedPotential::physical`] is.
     pub fn bias_share(&self) -> f64 {
+        debug_assert!(!self.is_combined, "forces and bias are not apart");
         let force_norm = norms(&self.physical.forces);
         if self.scale == 0.0 || force_norm <= 0.0 {
             return 0.0;
@@ -238,8 +246,9 @@ impl BiasedPotential {
         self.scale * norms(&self.pull_back.gradient) / force_norm
     }
 
-    /// Power of the bias of the last evaluation on atoms with these velocities (Å/fs), eV/fs.
+    /// Power of the bias of the last evaluation on atoms with these velocities (Å/fs), eV/fs; known as [`BiasedPotential::physical`] is.
     pub fn bias_power(&self, velocities: &[Vec3]) -> f64 {
+        debug_assert!(!self.is_combined, "forces and bias are not apart");
         if self.scale == 0.0 {
             return 0.0;
         }

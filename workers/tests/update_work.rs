@@ -89,7 +89,6 @@ fn the_work_of_the_bias_goes_on_with_the_smaller_velocities() {
     assert!(missing.abs() < 0.3 * wrong.abs(), "{missing} of {wrong}");
 }
 
-/// The work is taken out once, however the walk is interrupted.
 /// A walk with two candidates, and the mixture that takes in a third.
 fn after_an_update(settings: &WalkSettings, before: &Arc<Mixture>) -> (Assignment, Arc<Mixture>) {
     let mut next = assignment(seed_structure("vacancy"), 500);
@@ -128,21 +127,24 @@ fn traces_have_the_grade_under_the_original_mixture_too() {
     }
 }
 
+/// The work is taken out once, however the walk is interrupted.
 #[test]
 fn an_interruption_after_an_update_changes_nothing() {
-    let (settings, before) = (eager(), mixture());
-    let (mut next, after) = after_an_update(&settings, &before);
-    next.last_step = 80;
-    let whole = under(&settings, Arc::clone(&after), &next);
-    let kept = WalkSettings { remove_update_work: false, ..settings.clone() };
-    assert_ne!(under(&kept, Arc::clone(&after), &next).progress.temperature, whole.progress.temperature);
-    for last_step in [61, 61, 70, 80] {
-        next.last_step = last_step;
-        next.checkpoint = Some(under(&settings, Arc::clone(&after), &next).checkpoint);
-        // The verdict is that of the first assignment.
-        next.verdict = None;
+    for bias_norm_interval in [1, 4] {
+        let (settings, before) = (WalkSettings { bias_norm_interval, ..eager() }, mixture());
+        let (mut next, after) = after_an_update(&settings, &before);
+        next.last_step = 80;
+        let whole = under(&settings, Arc::clone(&after), &next);
+        let kept = WalkSettings { remove_update_work: false, ..settings.clone() };
+        assert_ne!(under(&kept, Arc::clone(&after), &next).progress.temperature, whole.progress.temperature);
+        for last_step in [61, 61, 70, 80] {
+            next.last_step = last_step;
+            next.checkpoint = Some(under(&settings, Arc::clone(&after), &next).checkpoint);
+            // The verdict is that of the first assignment.
+            next.verdict = None;
+        }
+        assert_eq!(next.checkpoint, Some(whole.checkpoint));
     }
-    assert_eq!(next.checkpoint, Some(whole.checkpoint));
 }
 
 #[test]

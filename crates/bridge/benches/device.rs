@@ -43,7 +43,7 @@ fn variable<T: std::str::FromStr>(name: &str, default: T) -> T {
 fn real(mut settings: PythonSettings) {
     settings.device = variable("CALMWALK_DEVICE", "cpu".to_owned());
     settings.precision = match variable("CALMWALK_PRECISION", "double".to_owned()).as_str() {
-        "single" => Precision::Single,
+        "single" => Precision::Mixed,
         "double" => Precision::Double,
         other => panic!("CALMWALK_PRECISION={other}, expected single or double"),
     };

@@ -8,6 +8,8 @@ use crate::call::{BondGeometry, Topology};
 const SPACING: f64 = 1.1;
 /// Largest displacement from the lattice, in distances.
 const JITTER: f64 = 0.12;
+/// Skin of the neighbour list, Å.
+const SKIN: f64 = 0.3;
 /// Step of the differences, Å, or strain.
 const STEP: f64 = 4e-3;
 /// Largest error of a derivative, of its scale.
@@ -28,6 +30,8 @@ pub(crate) enum Asked<'a> {
         cotangents: &'a [&'a [f64]],
         /// Whether the energy is added.
         with_energy: bool,
+        /// Whether the model pulls back from what its evaluation of the same structures, asked for just before, has kept.
+        kept: bool,
     },
 }
 
@@ -51,7 +55,7 @@ pub(crate) struct TestResult {
 pub struct SelfTestReport {
     /// Each comparison: what, its error, its tolerance.
     pub figures: Vec<(String, f64, f64)>,
-    /// Whether a repeated call gives the same bits.
+    /// Whether a repeated call gives the same bits, and a pull-back those of one that evaluates anew.
     pub is_deterministic: bool,
     /// Whether a structure has the same bits alone and beside others.
     pub is_batch_independent: bool,
@@ -124,7 +128,7 @@ pub(crate) fn run(
 
 /// The structure that shows later whether a server still gives what it gave at the start.
 pub(crate) fn reference(subject: &TestSubject<'_>) -> Result<BondGeometry, StructureError> {
-    geometry(&structure(subject.elements, false), subject, 0.3)
+    geometry(&structure(subject.elements, false), subject, SKIN)
 }
 
 struct SelfTest<'a, M> {
@@ -134,23 +138,25 @@ struct SelfTest<'a, M> {
 }
 
 impl<M: Evaluate> SelfTest<'_, M> {
-    fn evaluate(&mut self, structures: &[Structure]) -> Result<Vec<TestResult>, SelfTestError> {
-        self.evaluate_with_skin(structures, 0.3)
-    }
-
-    fn evaluate_with_skin(
+    fn ask(
         &mut self,
-        structures: &[Structure],
+        structures: &[&Structure],
         skin: f64,
+        asked: Asked<'_>,
     ) -> Result<Vec<TestResult>, SelfTestError> {
         let geometries = structures.iter().map(|one| geometry(one, self.subject, skin));
         let geometries = geometries.collect::<Result<Vec<_>, _>>()?;
         let references: Vec<_> = geometries.iter().collect();
-        self.model.ask(&references, Asked::Forces).map_err(SelfTestError::Call)
+        self.model.ask(&references, asked).map_err(SelfTestError::Call)
+    }
+
+    fn evaluate(&mut self, structures: &[Structure]) -> Result<Vec<TestResult>, SelfTestError> {
+        let structures: Vec<_> = structures.iter().collect();
+        self.ask(&structures, SKIN, Asked::Forces)
     }
 
     fn pull_back(&mut self, structure: &Structure, cotangent: &[f64]) -> Result<TestResult, SelfTestError> {
-        let results = self.pull_back_all(&[(structure, cotangent)], false)?;
+        let results = self.pull_back_all(&[(structure, cotangent)], false, false)?;
         results.into_iter().next().ok_or_else(|| SelfTestError::Call("no result".to_owned()))
     }
 
@@ -158,13 +164,30 @@ impl<M: Evaluate> SelfTest<'_, M> {
         &mut self,
         all: &[(&Structure, &[f64])],
         with_energy: bool,
+        kept: bool,
     ) -> Result<Vec<TestResult>, SelfTestError> {
-        let geometries = all.iter().map(|(one, _)| geometry(one, self.subject, 0.3));
-        let geometries = geometries.collect::<Result<Vec<_>, _>>()?;
-        let references: Vec<_> = geometries.iter().collect();
-        let cotangents: Vec<_> = all.iter().map(|(_, cotangent)| *cotangent).collect();
-        let asked = Asked::Gradients { cotangents: &cotangents, with_energy };
-        self.model.ask(&references, asked).map_err(SelfTestError::Call)
+        let (structures, cotangents): (Vec<_>, Vec<_>) = all.iter().copied().unzip();
+        self.ask(&structures, SKIN, Asked::Gradients { cotangents: &cotangents, with_energy, kept })
+    }
+
+    /// Pull-backs from what an evaluation kept against those that evaluate anew, since the device did not wait for them: which of the two a
+    /// walker has depends on time.
+    fn kept(&mut self, all: &[(&Structure, &[f64])], with_energy: bool) -> Result<(), SelfTestError> {
+        let structures: Vec<_> = all.iter().map(|(structure, _)| *structure).collect();
+        self.ask(&structures, SKIN, if with_energy { Asked::NoForces } else { Asked::Forces })?;
+        let kept = self.pull_back_all(all, with_energy, true)?;
+        let anew = self.pull_back_all(all, with_energy, false)?;
+        self.report.is_deterministic &= kept == anew;
+        let of = if with_energy { "energy and features together" } else { "the features" };
+        let parts: [(Part, &str); 2] = [(|one| &one.vectors, "gradient"), (|one| &one.virial, "virial")];
+        for (numbers, name) in parts {
+            let pairs = kept.iter().zip(&anew);
+            let error = pairs.map(|(a, b)| distance(numbers(a), numbers(b))).fold(0.0, f64::max);
+            let scale: Vec<f64> = anew.iter().flat_map(numbers).copied().collect();
+            let what = format!("the {name} of {of} by what the evaluation kept");
+            self.compare(what, error, self.same(&scale));
+        }
+        Ok(())
     }
 
     fn compare(&mut self, what: String, error: f64, tolerance: f64) {
@@ -288,9 +311,8 @@ impl<M: Evaluate> SelfTest<'_, M> {
 
     /// Bonds beyond the cutoff contribute nothing.
     fn skin(&mut self, crystal: &Structure) -> Result<(), SelfTestError> {
-        let structures = [crystal.clone()];
         let (near, far) =
-            (self.evaluate_with_skin(&structures, 0.0)?, self.evaluate_with_skin(&structures, 0.8)?);
+            (self.ask(&[crystal], 0.0, Asked::Forces)?, self.ask(&[crystal], 0.8, Asked::Forces)?);
         let error = distance(&near[0].energies, &far[0].energies);
         self.compare(
             "the energies with bonds beyond the cutoff".to_owned(),
@@ -315,21 +337,19 @@ impl<M: Evaluate> SelfTest<'_, M> {
             self.report.is_deterministic &= first == self.pull_back(cluster, &cotangent)?;
             let of_crystal = random_numbers(crystal.len() * self.subject.dimension, 10);
             let neighbour = (crystal, &of_crystal[..]);
-            let beside = self.pull_back_all(&[neighbour, (cluster, &cotangent), neighbour], false)?;
+            let all = [neighbour, (cluster, &cotangent[..]), neighbour];
+            let beside = self.pull_back_all(&all, false, false)?;
             self.report.is_batch_independent &= beside.get(1) == Some(&first);
+            self.kept(&all, false)?;
         }
         Ok(())
     }
 
     /// Evaluations without forces, and one gradient of energy and features, against those apart.
     fn combined_gradients(&mut self, cluster: &Structure, crystal: &Structure) -> Result<(), SelfTestError> {
-        let structures = [crystal.clone(), cluster.clone(), crystal.clone()];
-        let geometries = structures.iter().map(|one| geometry(one, self.subject, 0.3));
-        let geometries = geometries.collect::<Result<Vec<_>, _>>()?;
-        let references: Vec<_> = geometries.iter().collect();
-        let mut ask =
-            |which: &[&BondGeometry]| self.model.ask(which, Asked::NoForces).map_err(SelfTestError::Call);
-        let (alone, again, beside) = (ask(&references[1..2])?, ask(&references[1..2])?, ask(&references)?);
+        let mut ask = |structures: &[&Structure]| self.ask(structures, SKIN, Asked::NoForces);
+        let (alone, again) = (ask(&[cluster])?, ask(&[cluster])?);
+        let beside = ask(&[crystal, cluster, crystal])?;
         self.report.is_deterministic &= alone == again;
         self.report.is_batch_independent &= alone[0] == beside[1];
         let plain = self.evaluate(std::slice::from_ref(cluster))?.swap_remove(0);
@@ -341,10 +361,13 @@ impl<M: Evaluate> SelfTest<'_, M> {
         let cotangent = random_numbers(cluster.len() * self.subject.dimension, 9);
         let of_crystal = random_numbers(crystal.len() * self.subject.dimension, 10);
         let (own, neighbour) = ((cluster, &cotangent[..]), (crystal, &of_crystal[..]));
-        let (first, again) = (self.pull_back_all(&[own], true)?, self.pull_back_all(&[own], true)?);
+        let first = self.pull_back_all(&[own], true, false)?;
+        let again = self.pull_back_all(&[own], true, false)?;
         self.report.is_deterministic &= first == again;
-        let beside = self.pull_back_all(&[neighbour, own, neighbour], true)?;
+        let all = [neighbour, own, neighbour];
+        let beside = self.pull_back_all(&all, true, false)?;
         self.report.is_batch_independent &= beside.get(1) == first.first();
+        self.kept(&all, true)?;
         let apart = self.pull_back(cluster, &cotangent)?;
         let parts: [(Part, &str); 2] = [(|one| &one.vectors, "gradient"), (|one| &one.virial, "virial")];
         for (numbers, name) in parts {

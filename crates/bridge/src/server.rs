@@ -275,7 +275,7 @@ pub(crate) struct Synchronous<'a> {
 }
 
 impl Synchronous<'_> {
-    /// Sends a batch in the arena of a slot and waits.
+    /// Sends a batch in the arena of a slot and waits. A pull-back from what was kept must follow the evaluation of the same structures.
     ///
     /// # Errors
     /// Faults of the server.
@@ -286,12 +286,14 @@ impl Synchronous<'_> {
         asked: Asked<'_>,
     ) -> Result<Vec<TestResult>, ServerFault> {
         let settings = &self.setup.settings;
-        self.server.write(slot, structures)?;
+        if !matches!(asked, Asked::Gradients { kept: true, .. }) {
+            self.server.write(slot, structures)?;
+        }
         let features = self.server.description.features.form != AdapterFeatures::None;
         let request = match asked {
             Asked::Forces => BatchRequest::Evaluate { features, forces: true },
             Asked::NoForces => BatchRequest::Evaluate { features, forces: false },
-            Asked::Gradients { cotangents, with_energy } => {
+            Asked::Gradients { cotangents, with_energy, .. } => {
                 let arena = &mut self.server.arenas[slot];
                 arena.write_cotangents(cotangents.iter().map(|one| Some(*one)));
                 arena.write_energy_cotangents(cotangents.iter().map(|_| with_energy));

@@ -86,13 +86,13 @@ impl ServerLoop<'_> {
         let cotangent = random_numbers(geometry.positions.len() * dimension, 5);
         let structures = vec![geometry; copies];
         let cotangents = vec![&cotangent[..]; copies];
-        let gradients = |with_energy| Asked::Gradients { cotangents: &cotangents, with_energy };
+        let gradients = |with_energy, kept| Asked::Gradients { cotangents: &cotangents, with_energy, kept };
         let mut asked = vec![Asked::Forces];
         if has_features {
-            asked.push(gradients(false));
+            asked.extend([gradients(false, true), gradients(false, false)]);
         }
         if has_features && self.setup.settings.combined_gradients {
-            asked.extend([Asked::NoForces, gradients(true)]);
+            asked.extend([Asked::NoForces, gradients(true, true), gradients(true, false)]);
         }
         let mut all = vec![Copied::new(); SLOTS * copies];
         for slot in 0..SLOTS {

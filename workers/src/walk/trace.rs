@@ -27,7 +27,7 @@ impl RunningWalk<'_> {
         if interval == 0 || in_reference_run || !self.step().is_multiple_of(interval) {
             return Ok(());
         }
-        let point = self.trace_point()?;
+        let Some(point) = self.trace_point()? else { return Ok(()) };
         self.state.trace_points += 1;
         self.trace.push(point);
         // Long assignments have many points.
@@ -43,14 +43,19 @@ impl RunningWalk<'_> {
         std::mem::take(&mut self.trace)
     }
 
-    fn trace_point(&mut self) -> Result<TracePoint, WalkError> {
+    /// `None` if forces and bias of the step cannot be told apart: the walk continues.
+    fn trace_point(&mut self) -> Result<Option<TracePoint>, WalkError> {
         let (gamma_max, gamma_max_original) = self.largest_grades()?;
-        self.separate_bias()?;
+        match self.separate_bias() {
+            Ok(()) => {}
+            Err(WalkError::Unavailable(reason)) => return Err(WalkError::Unavailable(reason)),
+            Err(_) => return Ok(None),
+        }
         let trace = |tensor: &Matrix3| tensor[0][0] + tensor[1][1] + tensor[2][2];
         // The dynamics know no virial of the bias.
         let of_bias = trace(self.potential.bias_virial()) / self.dynamics.structure().cell.volume();
         let pressure = self.dynamics.pressure_tensor().map(|pressure| trace(&pressure) - of_bias);
-        Ok(TracePoint {
+        Ok(Some(TracePoint {
             number: self.state.trace_points,
             segment: self.state.segment,
             step: self.step(),
@@ -66,7 +71,7 @@ impl RunningWalk<'_> {
             bias_share: self.potential.bias_share(),
             bias_work: self.potential.state.work.total,
             gamma_max_original,
-        })
+        }))
     }
 
     /// γ_max under the walker's mixture and under the original one, if the structure can be graded.
