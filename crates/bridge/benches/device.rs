@@ -2,8 +2,8 @@
 //!
 //! `CALMWALK_PYTHON=…/python cargo bench -p bridge --bench device`
 //!
-//! With `CALMWALK_MODEL` (a file for the adapter named by `CALMWALK_ADAPTER`), further tables are those of a real model: walkers with 108
-//! atoms of aluminium, single calls against batches, with two gradients a step and with one (`walk.bias_norm_interval = 10`).
+//! With `CALMWALK_MODEL` (a file for the adapter named by `CALMWALK_ADAPTER`), the tables are those of a real model instead: walkers with
+//! 108 atoms of aluminium, single calls against batches, with two gradients a step and with one (`walk.bias_norm_interval = 10`).
 //! `CALMWALK_DEVICE` (cpu), `CALMWALK_PRECISION` (double), `CALMWALK_WALKERS` (64) and `CALMWALK_SECONDS` (20, of each line) say how.
 
 use std::path::{Path, PathBuf};
@@ -24,12 +24,12 @@ fn main() {
         println!("CALMWALK_PYTHON names no Python with numpy: nothing to measure");
         return;
     };
-    overhead(&python);
-    simulated(&python);
-    if let (Some(model), Ok(adapter)) =
-        (std::env::var_os("CALMWALK_MODEL"), std::env::var("CALMWALK_ADAPTER"))
-    {
-        real(PythonSettings::new(&python, &adapter, Some(Path::new(&model))));
+    match (std::env::var_os("CALMWALK_MODEL"), std::env::var("CALMWALK_ADAPTER")) {
+        (Some(model), Ok(adapter)) => real(PythonSettings::new(&python, &adapter, Some(Path::new(&model)))),
+        _ => {
+            overhead(&python);
+            simulated(&python);
+        }
     }
 }
 

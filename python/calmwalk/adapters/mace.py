@@ -105,32 +105,43 @@ class Mace:
         """Positions are zero and the bonds are MACE's shifts, so that no cell is needed and autograd gives
         ∂/∂(bond)."""
         self._passes += 1
-        near = np.flatnonzero(np.einsum("bx,bx->b", batch.bonds, batch.bonds) < self._cutoff**2)
-        bonds = self._tensor(batch.bonds[near], self._type).requires_grad_(True)
-        ends = self._tensor(np.stack([batch.centres[near], batch.neighbours[near]]), torch.int64)
-        structures = self._tensor(batch.structure_of_atom, torch.int64)
-        atoms, count = batch.n_atoms, batch.n_structures
-        sizes = torch.bincount(structures, minlength=count).cumsum(0)
-        species = self._tensor(batch.species, torch.int64)
+        fixed = self._fixed(batch)
+        bonds = self._tensor(batch.bonds, torch.float64)
+        near = torch.nonzero(bonds.square().sum(1) < self._cutoff**2).squeeze(1)
+        bonds = bonds[near].to(self._type).requires_grad_(True)
+        ends = fixed["ends"][:, near]
         output = self._model(
-            {
+            {**fixed["inputs"], "shifts": bonds, "unit_shifts": torch.zeros_like(bonds), "edge_index": ends},
+            compute_force=False,
+        )
+        owners, features = fixed["owners"][near], output["node_feats"][:, self._columns]
+        return _Graph(output["node_energy"], features, bonds, ends, owners, batch.n_structures)
+
+    def _fixed(self, batch: Batch) -> dict[str, Any]:
+        """What depends on the topology alone: MACE's inputs, and for each bond its ends and its structure."""
+        if "mace" not in batch.fixed:
+            atoms, count = batch.n_atoms, batch.n_structures
+            structures = self._tensor(batch.structure_of_atom, torch.int64)
+            sizes = torch.bincount(structures, minlength=count).cumsum(0)
+            species = self._tensor(batch.species, torch.int64)
+            inputs = {
                 "positions": torch.zeros(atoms, 3, dtype=self._type, device=self._device),
-                "shifts": bonds,
-                "unit_shifts": torch.zeros_like(bonds, requires_grad=False),
                 "cell": torch.zeros(3 * count, 3, dtype=self._type, device=self._device),
-                "edge_index": ends,
                 "batch": structures,
                 "ptr": torch.cat([torch.zeros(1, dtype=torch.int64, device=self._device), sizes]),
                 "node_attrs": torch.nn.functional.one_hot(species, len(self.info.elements)).to(self._type),
                 "head": torch.full((count,), self._head, dtype=torch.int64, device=self._device),
-            },
-            compute_force=False,
-        )
-        owners = self._tensor(batch.structure_of_bond[near], torch.int64)
-        features = output["node_feats"][:, self._columns]
-        return _Graph(output["node_energy"], features, bonds, ends, owners, count)
+            }
+            batch.fixed["mace"] = {
+                "inputs": inputs,
+                "ends": self._tensor(np.stack([batch.centres, batch.neighbours]), torch.int64),
+                "owners": self._tensor(batch.structure_of_bond, torch.int64),
+            }
+        tensors: dict[str, Any] = batch.fixed["mace"]
+        return tensors
 
     def _tensor(self, array: np.ndarray, dtype: torch.dtype) -> torch.Tensor:
+        """A copy on the device."""
         return torch.as_tensor(array).to(device=self._device, dtype=dtype, copy=True)
 
 
