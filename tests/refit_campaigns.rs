@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::path::Path;
-use std::process::Stdio;
+use std::process::{Command, Stdio};
 
 use atoms::extxyz::Frame;
 use atoms::read_extxyz;
@@ -294,6 +294,14 @@ fn wait_for_label(place: &LabelCampaign, what: &str, is_so: impl Fn(&Json) -> bo
     });
 }
 
+/// Whether all walks have ended, the control walks among them.
+fn have_all_walks_ended(status: &Json) -> bool {
+    let walks = status["walks"].as_array().map_or(&[][..], Vec::as_slice);
+    let has_ended =
+        |walk: &Json| !["running", "waiting"].contains(&walk["state"].as_str().unwrap_or_default());
+    walks.iter().any(|walk| walk["origin"] == "control") && walks.iter().all(has_ended)
+}
+
 /// Each attempt fails.
 const REFUSED: &str = r#"
 [refit]
@@ -308,12 +316,7 @@ fn labels_that_come_after_an_attempt_are_trained_on() {
     let small = Small { mode: "live", max_per_walk: 2, refit: REFUSED, ..Small::default() };
     let place = live_with_late_labels(&small, "");
     let mut run = place.run();
-    let has_ended =
-        |walk: &Json| !["running", "waiting"].contains(&walk["state"].as_str().unwrap_or_default());
-    wait_for_label(&place, "all walks have ended", |status| {
-        let walks = status["walks"].as_array().map_or(&[][..], Vec::as_slice);
-        walks.iter().any(|walk| walk["origin"] == "control") && walks.iter().all(has_ended)
-    });
+    wait_for_label(&place, "all walks have ended", have_all_walks_ended);
     let output = calmwalk(place.path(), ["refit", place.argument()]);
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
     fs::write(place.path().join("go"), "").unwrap();
@@ -321,9 +324,45 @@ fn labels_that_come_after_an_attempt_are_trained_on() {
     let versions = on_store(place.location(), async |store| store.versions().await.unwrap());
     let [first, last] = &versions[..] else { panic!("two attempts: {versions:?}") };
     assert_eq!(first.structures, last.structures, "nothing was found meanwhile");
+    assert!(first.labels < last.labels && last.labels == found(&place), "{versions:?}");
+}
+
+/// Number of structures and control frames of a campaign.
+fn found(place: &LabelCampaign) -> u64 {
     let candidates = place.status()["candidates"].take();
-    let found = ["accepted", "control"].map(|kind| candidates[kind].as_u64().unwrap());
-    assert!(first.labels < last.labels && last.labels == found.iter().sum::<u64>(), "{versions:?}");
+    ["accepted", "control"].map(|kind| candidates[kind].as_u64().unwrap()).iter().sum()
+}
+
+/// One attempt beside the walks, as soon as a structure is accepted.
+const BESIDE_WALKS: &str = r#"
+[refit]
+replay = ["replay.extxyz"]
+after_structures = 1
+held_out = 0.0
+max_attempts = 1
+method = { command = { program = ["false"] } }
+"#;
+
+/// A refit that crashes before it knows its labels does not hide those that come later, though nothing is found meanwhile.
+#[test]
+fn labels_that_come_after_a_crash_are_trained_on() {
+    let small = Small { mode: "live", max_per_walk: 2, refit: BESIDE_WALKS, ..Small::default() };
+    let place = live_with_late_labels(&small, "");
+    // The refit waits for someone to write into this pipe.
+    let directory = place.path().join("refit/1");
+    fs::create_dir_all(&directory).unwrap();
+    assert!(Command::new("mkfifo").arg(directory.join("set.json")).status().unwrap().success());
+    let mut run = place.run();
+    wait_for_label(&place, "all walks have ended", have_all_walks_ended);
+    signal(wait_for_process(place.path(), "refitter"), "ABRT");
+    let versions = || on_store(place.location(), async |store| store.versions().await.unwrap());
+    wait_until("the crash is recorded", || versions().len() == 1);
+    fs::write(place.path().join("go"), "").unwrap();
+    assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
+    let versions = versions();
+    let [crashed, last] = &versions[..] else { panic!("two attempts: {versions:?}") };
+    assert!(crashed.reason.contains("SIGABRT"), "{crashed:?}");
+    assert_eq!((crashed.structures, last.labels), (last.structures, found(&place)), "{versions:?}");
 }
 
 /// Each version is its parent.

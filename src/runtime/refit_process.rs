@@ -162,7 +162,7 @@ impl<'a> RefitProcess<'a> {
             labels: 0,
             model_hash: String::new(),
             mixture_hash: String::new(),
-            figures: refit::figures_of_crashed(self.run.directory, number),
+            figures: refit::figures_of_crashed((store, &campaign.config), self.run.directory, number).await?,
             seconds: 0.0,
             core_hours: 0.0,
             time: unix_milliseconds(),
