@@ -8,11 +8,14 @@ use atoms::extxyz::Frame;
 use atoms::read_extxyz;
 use serde_json::Value as Json;
 use store::{ExportFilter, ExportSource, Fate};
+use wire::Origin;
 
 use crate::common::campaign::{Outcome, Small, outcome};
 use crate::common::hosts::{Hosts, uninterrupted_outcome};
 use crate::common::label_campaign::{LabelCampaign, WRITE_FIXED_LABEL, on_store};
-use crate::common::processes::{assert_no_leftovers, pause_walkers, signal, wait_for_process, wait_until};
+use crate::common::processes::{
+    assert_no_leftovers, pause_walkers, processes_running, signal, wait_for_process, wait_until,
+};
 use crate::common::{Running, calmwalk, config, deviation, program, stderr, succeed, write_frames};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "."];
@@ -383,23 +386,29 @@ fn a_campaign_without_walks_left_waits_for_its_labels() {
     // Control walks take as long as the walks that they match.
     let path = place.path().join("campaign.toml");
     let text = fs::read_to_string(&path).unwrap();
-    fs::write(&path, text.replace("equilibration_steps = 20", "equilibration_steps = 3000")).unwrap();
+    fs::write(&path, text.replace("equilibration_steps = 20", "equilibration_steps = 1000")).unwrap();
     let mut run = place.run();
-    wait_for_label(&place, "the biased walks have ended", |status| {
-        let walks = status["walks"].as_array().map_or(&[][..], Vec::as_slice);
-        let mut biased = walks.iter().filter(|walk| walk["origin"] == "biased");
-        status["candidates"]["accepted"] == 3 && biased.all(|walk| walk["state"] == "budget")
+    wait_for_process(place.path(), "walker");
+    let walks = || on_store(place.location(), async |store| store.load_walks().await.unwrap());
+    wait_until("the biased walks have ended", || {
+        let walks = walks();
+        let mut biased = walks.iter().filter(|walk| walk.origin == Origin::Biased);
+        !walks.is_empty() && biased.all(|walk| walk.state == "budget")
     });
     let held = pause_walkers(place.path(), 2);
-    let walks = place.status()["walks"].take();
-    assert!(walks.as_array().unwrap().iter().any(|walk| walk["state"] == "running"), "{walks}");
+    wait_for_label(&place, "a structure has a label", |_| true);
+    let walks = walks();
+    assert!(walks.iter().any(|walk| walk.is_active()), "{walks:?}");
+    assert!(place.status()["candidates"]["accepted"] == 3 && place.jobs("queued") > 0);
     succeed(place.path(), ["refit", place.argument()]);
-    // The run looks for new versions each second.
-    std::thread::sleep(std::time::Duration::from_millis(2500));
+    wait_until("the run knows the version", || place.said().contains("a newer version of the potential"));
     held.resume();
     wait_until("the version is in force", || place.said().contains("version 1 of the potential is in force"));
-    std::thread::sleep(std::time::Duration::from_millis(500));
-    assert!(run.0.try_wait().unwrap().is_none(), "it waits for labels: {}", place.said());
+    // No walk starts with it: the labellers alone do.
+    wait_until("a labeller is at work", || {
+        let is_over = run.0.try_wait().unwrap().is_some();
+        is_over || !processes_running(place.path(), "labeller").is_empty()
+    });
     fs::write(place.path().join("go"), "").unwrap();
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
     assert_eq!((place.jobs("queued"), place.jobs("leased")), (0, 0));

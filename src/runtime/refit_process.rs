@@ -178,6 +178,9 @@ impl<'a> RefitProcess<'a> {
             version.is_some_and(|version| version.number > campaign.version_number())
         };
         if is_newer(schedule.in_force()) {
+            if !superseded.is_cancelled() {
+                log_and_print("a newer version of the potential is registered: the walks with this one end");
+            }
             superseded.cancel();
         } else if is_newer(schedule.newest()) {
             walks_end.cancel();
