@@ -227,7 +227,7 @@ fn seed_structures(temperatures: &[f64]) -> Vec<SeedStructurePlan> {
     let conditions = |temperature: &f64| WalkConditions {
         temperature: *temperature,
         tau: 0.15,
-        volume_ramp: Some((1.0, 1.4)),
+        cell: wire::CellConditions::VolumeRamp { from: 1.0, to: 1.4 },
         ..WalkConditions::default()
     };
     let seed = |(number, frame): (usize, atoms::extxyz::Frame)| SeedStructurePlan {

@@ -2,17 +2,20 @@
 
 use std::fs;
 use std::path::Path;
-use std::process::Stdio;
+use std::process::{Command, Stdio};
 
 use atoms::extxyz::Frame;
 use atoms::read_extxyz;
 use serde_json::Value as Json;
 use store::{ExportFilter, ExportSource, Fate};
+use wire::Origin;
 
 use crate::common::campaign::{Outcome, Small, outcome};
 use crate::common::hosts::{Hosts, uninterrupted_outcome};
 use crate::common::label_campaign::{LabelCampaign, WRITE_FIXED_LABEL, on_store};
-use crate::common::processes::{assert_no_leftovers, pause_walkers, signal, wait_for_process, wait_until};
+use crate::common::processes::{
+    assert_no_leftovers, pause_walkers, processes_running, signal, wait_for_process, wait_until,
+};
 use crate::common::{Running, calmwalk, config, deviation, program, stderr, succeed, write_frames};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "."];
@@ -294,6 +297,14 @@ fn wait_for_label(place: &LabelCampaign, what: &str, is_so: impl Fn(&Json) -> bo
     });
 }
 
+/// Whether all walks have ended, the control walks among them.
+fn have_all_walks_ended(status: &Json) -> bool {
+    let walks = status["walks"].as_array().map_or(&[][..], Vec::as_slice);
+    let has_ended =
+        |walk: &Json| !["running", "waiting"].contains(&walk["state"].as_str().unwrap_or_default());
+    walks.iter().any(|walk| walk["origin"] == "control") && walks.iter().all(has_ended)
+}
+
 /// Each attempt fails.
 const REFUSED: &str = r#"
 [refit]
@@ -308,12 +319,7 @@ fn labels_that_come_after_an_attempt_are_trained_on() {
     let small = Small { mode: "live", max_per_walk: 2, refit: REFUSED, ..Small::default() };
     let place = live_with_late_labels(&small, "");
     let mut run = place.run();
-    let has_ended =
-        |walk: &Json| !["running", "waiting"].contains(&walk["state"].as_str().unwrap_or_default());
-    wait_for_label(&place, "all walks have ended", |status| {
-        let walks = status["walks"].as_array().map_or(&[][..], Vec::as_slice);
-        walks.iter().any(|walk| walk["origin"] == "control") && walks.iter().all(has_ended)
-    });
+    wait_for_label(&place, "all walks have ended", have_all_walks_ended);
     let output = calmwalk(place.path(), ["refit", place.argument()]);
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
     fs::write(place.path().join("go"), "").unwrap();
@@ -321,9 +327,45 @@ fn labels_that_come_after_an_attempt_are_trained_on() {
     let versions = on_store(place.location(), async |store| store.versions().await.unwrap());
     let [first, last] = &versions[..] else { panic!("two attempts: {versions:?}") };
     assert_eq!(first.structures, last.structures, "nothing was found meanwhile");
+    assert!(first.labels < last.labels && last.labels == found(&place), "{versions:?}");
+}
+
+/// Number of structures and control frames of a campaign.
+fn found(place: &LabelCampaign) -> u64 {
     let candidates = place.status()["candidates"].take();
-    let found = ["accepted", "control"].map(|kind| candidates[kind].as_u64().unwrap());
-    assert!(first.labels < last.labels && last.labels == found.iter().sum::<u64>(), "{versions:?}");
+    ["accepted", "control"].map(|kind| candidates[kind].as_u64().unwrap()).iter().sum()
+}
+
+/// One attempt beside the walks, as soon as a structure is accepted.
+const BESIDE_WALKS: &str = r#"
+[refit]
+replay = ["replay.extxyz"]
+after_structures = 1
+held_out = 0.0
+max_attempts = 1
+method = { command = { program = ["false"] } }
+"#;
+
+/// A refit that crashes before it knows its labels does not hide those that come later, though nothing is found meanwhile.
+#[test]
+fn labels_that_come_after_a_crash_are_trained_on() {
+    let small = Small { mode: "live", max_per_walk: 2, refit: BESIDE_WALKS, ..Small::default() };
+    let place = live_with_late_labels(&small, "");
+    // The refit waits for someone to write into this pipe.
+    let directory = place.path().join("refit/1");
+    fs::create_dir_all(&directory).unwrap();
+    assert!(Command::new("mkfifo").arg(directory.join("set.json")).status().unwrap().success());
+    let mut run = place.run();
+    wait_for_label(&place, "all walks have ended", have_all_walks_ended);
+    signal(wait_for_process(place.path(), "refitter"), "ABRT");
+    let versions = || on_store(place.location(), async |store| store.versions().await.unwrap());
+    wait_until("the crash is recorded", || versions().len() == 1);
+    fs::write(place.path().join("go"), "").unwrap();
+    assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
+    let versions = versions();
+    let [crashed, last] = &versions[..] else { panic!("two attempts: {versions:?}") };
+    assert!(crashed.reason.contains("SIGABRT"), "{crashed:?}");
+    assert_eq!((crashed.structures, last.labels), (last.structures, found(&place)), "{versions:?}");
 }
 
 /// Each version is its parent.
@@ -344,23 +386,29 @@ fn a_campaign_without_walks_left_waits_for_its_labels() {
     // Control walks take as long as the walks that they match.
     let path = place.path().join("campaign.toml");
     let text = fs::read_to_string(&path).unwrap();
-    fs::write(&path, text.replace("equilibration_steps = 20", "equilibration_steps = 3000")).unwrap();
+    fs::write(&path, text.replace("equilibration_steps = 20", "equilibration_steps = 1000")).unwrap();
     let mut run = place.run();
-    wait_for_label(&place, "the biased walks have ended", |status| {
-        let walks = status["walks"].as_array().map_or(&[][..], Vec::as_slice);
-        let mut biased = walks.iter().filter(|walk| walk["origin"] == "biased");
-        status["candidates"]["accepted"] == 3 && biased.all(|walk| walk["state"] == "budget")
+    wait_for_process(place.path(), "walker");
+    let walks = || on_store(place.location(), async |store| store.load_walks().await.unwrap());
+    wait_until("the biased walks have ended", || {
+        let walks = walks();
+        let mut biased = walks.iter().filter(|walk| walk.origin == Origin::Biased);
+        !walks.is_empty() && biased.all(|walk| walk.state == "budget")
     });
     let held = pause_walkers(place.path(), 2);
-    let walks = place.status()["walks"].take();
-    assert!(walks.as_array().unwrap().iter().any(|walk| walk["state"] == "running"), "{walks}");
+    wait_for_label(&place, "a structure has a label", |_| true);
+    let walks = walks();
+    assert!(walks.iter().any(|walk| walk.is_active()), "{walks:?}");
+    assert!(place.status()["candidates"]["accepted"] == 3 && place.jobs("queued") > 0);
     succeed(place.path(), ["refit", place.argument()]);
-    // The run looks for new versions each second.
-    std::thread::sleep(std::time::Duration::from_millis(2500));
+    wait_until("the run knows the version", || place.said().contains("a newer version of the potential"));
     held.resume();
     wait_until("the version is in force", || place.said().contains("version 1 of the potential is in force"));
-    std::thread::sleep(std::time::Duration::from_millis(500));
-    assert!(run.0.try_wait().unwrap().is_none(), "it waits for labels: {}", place.said());
+    // No walk starts with it: the labellers alone do.
+    wait_until("a labeller is at work", || {
+        let is_over = run.0.try_wait().unwrap().is_some();
+        is_over || !processes_running(place.path(), "labeller").is_empty()
+    });
     fs::write(place.path().join("go"), "").unwrap();
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
     assert_eq!((place.jobs("queued"), place.jobs("leased")), (0, 0));

@@ -30,7 +30,7 @@ impl ExpectedEnd {
         let under_way = status.walks.iter().filter(|walk| walk.is_active());
         // A walk at constant pressure counts no steps before the end of its reference run.
         let reference = |walk: &WalkStatus| {
-            let constant = walk.conditions.as_ref().is_some_and(|walk| walk.constant_pressure.is_some());
+            let constant = walk.conditions.as_ref().is_some_and(|walk| walk.constant_pressure().is_some());
             let is_left = constant && walk.step == 0 && walk.reference_volume.is_none();
             let made = walk.reference_step.unwrap_or_default();
             if is_left { steps("reference_steps").saturating_sub(made) } else { 0 }
@@ -85,9 +85,9 @@ mod tests {
             change(&mut status.walks[1]);
             ExpectedEnd::extrapolate(&status, &configuration, &queue).walks_hours.unwrap()
         };
-        let constant_pressure =
-            Some(wire::conditions::ConstantPressure { pressure: 1.0, start_volume: 1.0, cell_bias: false });
-        let conditions = Some(wire::WalkConditions { constant_pressure, ..Default::default() });
+        let constant = wire::ConstantPressure { pressure: 1.0, start_volume: 1.0, cell_bias: false };
+        let cell = wire::CellConditions::ConstantPressure(constant);
+        let conditions = Some(wire::WalkConditions { cell, ..Default::default() });
         let made = |steps: u64| 1.0 + (5_000 - steps) as f64 / 36_000.0;
         assert!((hours(&|walk| walk.conditions.clone_from(&conditions)) - made(0)).abs() < 1e-12);
         assert!((hours(&|walk| walk.reference_step = Some(3_200)) - made(3_200)).abs() < 1e-12);

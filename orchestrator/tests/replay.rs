@@ -247,6 +247,32 @@ fn control_frames_that_were_labelled_although_too_close_are_left_out_in_a_replay
     assert_eq!(changed, 1, "{log:?}");
 }
 
+/// Versions without this rule have accepted structures whatever their grades. Walks begin with the bound in the log, or without one.
+#[test]
+fn grades_beyond_the_bound_are_declined_in_a_replay_where_they_were() {
+    let bounded =
+        SelectorSettings { max_per_walk: 9, max_grade: Some(4.0), ..settings(CampaignMode::Reproducible) };
+    let before = SelectorSettings { max_grade: None, ..bounded.clone() };
+    let event = |number: u64| match number {
+        5..8 => Event::Structure { number, z: [0.0, 3.0 * number as f64, 0.0], close: false },
+        _ => Event::Nothing,
+    };
+    let scripts = [(0..30).map(event).collect()];
+    for (made_with, is_bounded) in [(&before, false), (&bounded, true)] {
+        let campaign = Campaign::begin(made_with, &scripts, 1).finish(false);
+        let log = log(&campaign);
+        let is_too_large =
+            |decision: &LoggedDecision| decision.detail.to_string().contains("grade_too_large");
+        assert_eq!(log.iter().any(|(recorded, _)| is_too_large(recorded)), is_bounded, "{log:?}");
+        let replayed = follow(&mut open(&campaign, &bounded, 1, &[]), &log);
+        for ((recorded, _), now) in log.iter().zip(replayed) {
+            let now = now.unwrap().decision;
+            let expected = (recorded.kind.as_str(), recorded.detail.to_string());
+            assert_eq!((now.kind, now.detail.to_string()), expected);
+        }
+    }
+}
+
 /// An update under which a training atom has no grade is left out again.
 #[test]
 fn updates_that_were_left_out_are_left_out_in_a_replay() {

@@ -86,8 +86,9 @@ proptest! {
             UpdateProtocol::Never => 0,
             UpdateProtocol::Cumulative => count("accepted"),
             // Walks of a seed structure share the mixture, if they follow one another.
-            UpdateProtocol::PerSeedStructure if live => return Ok(()),
+            UpdateProtocol::PerSeedStructure | UpdateProtocol::PerWalk if live => return Ok(()),
             UpdateProtocol::PerSeedStructure => count("accepted") + scripts.len(),
+            UpdateProtocol::PerWalk => count("accepted") + biased_walks(scripts.len()),
         };
         prop_assert_eq!(campaign.selector.mixture().version(), steps as u64, "one version an update");
     }

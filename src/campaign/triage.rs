@@ -116,7 +116,7 @@ impl<'a> Examiner<'a> {
     fn unstable_cell(&self, SourcedStructure { plan, .. }: &SourcedStructure) -> Option<String> {
         let settings = self.campaign.walk_settings();
         let is_biased =
-            |walk: &WalkConditions| walk.constant_pressure.is_some_and(|constant| constant.cell_bias);
+            |walk: &WalkConditions| walk.constant_pressure().is_some_and(|constant| constant.cell_bias);
         if settings.cell_bias.stress_scale.is_some() || !plan.walks.iter().any(is_biased) {
             return None;
         }

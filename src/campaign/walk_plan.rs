@@ -6,7 +6,7 @@ use atoms::Structure;
 use calm::rules::Positive;
 use md::BarostatSettings;
 use orchestrator::selector::SeedStructurePlan;
-use wire::{ConstantPressure, WalkConditions};
+use wire::{CellConditions, ConstantPressure, WalkConditions};
 
 use super::geometry::cell_bias_fault;
 use super::loader::Loader;
@@ -161,14 +161,13 @@ fn combinations(walk: &WalkSection, group: &WalkGroupSection) -> Vec<WalkConditi
     let cells = cells(walk, group);
     let mut walks = Vec::new();
     for temperature in or(&group.temperatures, walk.temperature) {
-        for (volume_ramp, constant_pressure) in cells.iter().copied() {
+        for cell in cells.iter().copied() {
             for tau in or(&group.tau_values, walk.tau) {
                 let conditions = |repeat| WalkConditions {
                     group: group.name.clone(),
                     temperature: temperature.get(),
                     tau: tau.get(),
-                    volume_ramp,
-                    constant_pressure,
+                    cell,
                     repeat,
                     version: 0,
                 };
@@ -184,7 +183,7 @@ fn cell_fault(walk: &WalkSection, conditions: &WalkConditions, structure: &Struc
     if structure.periodic == [false; 3] && conditions.changes_volume() {
         return Some("changes the volume, but the structure has no periodic direction".to_owned());
     }
-    let constant = conditions.constant_pressure?;
+    let constant = conditions.constant_pressure()?;
     let barostat = BarostatSettings { pressure: constant.pressure, ..walk.barostat.unwrap_or_default() };
     if let Some(fault) = barostat.fault(conditions.temperature, &walk.thermostat, structure) {
         return Some(format!("has a barostat: {fault}"));
@@ -193,17 +192,15 @@ fn cell_fault(walk: &WalkSection, conditions: &WalkConditions, structure: &Struc
     Some(format!("has a bias on the cell: {fault}"))
 }
 
-/// A volume ramp, or a constant pressure, or neither.
-type CellConditions = (Option<(f64, f64)>, Option<ConstantPressure>);
-
 /// What the cells of a group's walks do: its ramps, or each pressure with each volume at the start.
 fn cells(walk: &WalkSection, group: &WalkGroupSection) -> Vec<CellConditions> {
-    let ramp = |ramp: VolumeRampSection| (Some((ramp.from.get(), ramp.to.get())), None);
+    let ramp =
+        |ramp: VolumeRampSection| CellConditions::VolumeRamp { from: ramp.from.get(), to: ramp.to.get() };
     if !group.volume_ramps.is_empty() {
         return group.volume_ramps.iter().copied().map(ramp).collect();
     }
     let pressures = match (group.pressures.as_slice(), &walk.barostat) {
-        ([], None) => return vec![walk.volume_ramp.map_or((None, None), ramp)],
+        ([], None) => return vec![walk.volume_ramp.map_or(CellConditions::Fixed, ramp)],
         ([], Some(barostat)) => vec![barostat.pressure],
         (pressures, _) => pressures.to_vec(),
     };
@@ -213,7 +210,7 @@ fn cells(walk: &WalkSection, group: &WalkGroupSection) -> Vec<CellConditions> {
     };
     let cell_bias = group.cell_bias.unwrap_or(walk.cell_bias.is_some());
     let constant = |pressure: f64, start: Positive| {
-        (None, Some(ConstantPressure { pressure, start_volume: start.get(), cell_bias }))
+        CellConditions::ConstantPressure(ConstantPressure { pressure, start_volume: start.get(), cell_bias })
     };
     pressures.iter().flat_map(|pressure| volumes.iter().map(|start| constant(*pressure, *start))).collect()
 }
@@ -234,7 +231,7 @@ mod tests {
             let group: WalkGroupSection = toml::from_str(group).unwrap();
             let all = combinations(&walk, &group);
             let describe = |w: &WalkConditions| {
-                let (from, to) = w.volume_ramp.unwrap();
+                let (from, to) = w.volume_ramp().unwrap();
                 format!("{} {from}-{to} {} {}", w.temperature, w.tau, w.repeat)
             };
             all.iter().map(describe).collect::<Vec<_>>()

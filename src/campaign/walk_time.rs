@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use calm::Mixture;
 use potentials::grace::Threads;
 use wire::messages::Assignment;
-use wire::{CampaignId, Origin, WalkConditions, WalkId};
+use wire::{CampaignId, CellConditions, Origin, WalkConditions, WalkId};
 use workers::walk::{WalkContext, advance};
 
 use super::{LoadedCampaign, SourcedStructure};
@@ -106,9 +106,9 @@ impl StepTimes {
     /// the biased walk and of its control walk. An atom has fewer neighbours in a larger volume.
     fn steps(&self, conditions: &WalkConditions) -> [[f64; 2]; 2] {
         let [equilibration, biased] = self.steps;
-        let (from, to) = conditions.volume_ramp.unwrap_or((1.0, 1.0));
+        let (from, to) = conditions.volume_ramp().unwrap_or((1.0, 1.0));
         let (equilibration, biased) = (equilibration / from, biased * mean_density(from, to));
-        let reference = if conditions.constant_pressure.is_some() { self.reference } else { 0.0 };
+        let reference = if conditions.constant_pressure().is_some() { self.reference } else { 0.0 };
         let equilibration = reference + equilibration;
         let control = if self.control { equilibration + biased } else { 0.0 };
         [[biased, equilibration], [0.0, control]]
@@ -144,8 +144,7 @@ fn step_time(
     mixture: &Arc<Mixture>,
 ) -> Option<f64> {
     // At the volume of the seed structure.
-    let conditions =
-        WalkConditions { volume_ramp: None, constant_pressure: None, ..seed.plan.walks.first()?.clone() };
+    let conditions = WalkConditions { cell: CellConditions::Fixed, ..seed.plan.walks.first()?.clone() };
     let assignment = Assignment {
         campaign: CampaignId([0; 16]),
         walk: WalkId(0),

@@ -46,9 +46,9 @@ pub struct UpfitArgs {
     /// File for the new model; an existing file is replaced at the end
     #[arg(long, short, value_name = "NEW.npz")]
     output: PathBuf,
-    /// Passes over the training set
-    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
-    epochs: u64,
+    /// Passes over the training set [default: 40 with soap, 100 with adam]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    epochs: Option<u64>,
     /// Validate with the structures of this file, which must not be in DATA, and train with all of DATA; may be repeated
     #[arg(long, value_name = "FILE", conflicts_with = "validation_share")]
     validation: Vec<PathBuf>,
@@ -75,13 +75,13 @@ pub struct UpfitArgs {
     /// [default: 1]
     #[arg(long, value_name = "FILE=W", value_parser = file_weight)]
     weight: Vec<(PathBuf, f64)>,
-    /// Optimiser. adam: Adam with AMSGrad, as gracemaker has it; soap: Adam in the eigenbases of Shampoo's preconditioners, which needs fewer
-    /// epochs (docs/upfit.md); start with --learning-rate 0.01
+    /// Optimiser. soap: Adam in the eigenbases of Shampoo's preconditioners, which needs fewer epochs (docs/upfit.md); adam: Adam with
+    /// AMSGrad, as gracemaker has it
     #[arg(long, value_name = "NAME", default_value = Optimiser::default().name(), value_parser = optimisers())]
     optimiser: Optimiser,
-    /// Learning rate of the first update; it falls by half a cosine
-    #[arg(long, value_name = "RATE", default_value_t = 1e-3, value_parser = positive)]
-    learning_rate: f64,
+    /// Learning rate of the first update; it falls by half a cosine [default: 0.05 with soap, 0.001 with adam]
+    #[arg(long, value_name = "RATE", value_parser = positive)]
+    learning_rate: Option<f64>,
     /// Learning rate of the last update [default: a hundredth of --learning-rate]
     #[arg(long, value_name = "RATE", value_parser = not_negative)]
     min_learning_rate: Option<f64>,
@@ -177,14 +177,15 @@ impl UpfitArgs {
             weights.stress = self.stress_weight.unwrap_or(weights.stress);
         }
         loss.delta = self.huber_delta.unwrap_or(loss.delta);
-        let last = self.min_learning_rate.unwrap_or(0.01 * self.learning_rate);
+        let first = self.learning_rate.unwrap_or(self.optimiser.default_learning_rate());
+        let last = self.min_learning_rate.unwrap_or(0.01 * first);
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         UpfitSettings {
-            epochs: self.epochs,
+            epochs: self.epochs.unwrap_or(self.optimiser.default_epochs()),
             batch_size: self.batch_size as usize,
             optimiser: self.optimiser,
             loss,
-            learning_rate: CosineDecay { first: self.learning_rate, last },
+            learning_rate: CosineDecay { first, last },
             seed: self.rng_seed,
             frozen: self.freeze.clone(),
             average: self.average,

@@ -226,10 +226,17 @@ fn is_option(text: &str) -> bool {
 fn check_mixture(config: &Config) -> Result<(), InvalidValue> {
     let Config { campaign, calm, run, .. } = config;
     let one_by_one = campaign.mode == CampaignMode::Reproducible && run.walks_per_round.get() == 1;
-    if calm.update == UpdateProtocol::PerSeedStructure && !one_by_one {
-        let expected = "mode = \"reproducible\" and run.walks_per_round = 1: the mixture can be restarted for each seed \
-                        structure only if walks follow one another";
-        return wrong("calm.update", "\"per_seed_structure\"", expected);
+    let restarted = match calm.update {
+        UpdateProtocol::Cumulative | UpdateProtocol::Never => None,
+        UpdateProtocol::PerSeedStructure => Some(("\"per_seed_structure\"", "seed structure")),
+        UpdateProtocol::PerWalk => Some(("\"per_walk\"", "walk")),
+    };
+    if let Some((found, each)) = restarted.filter(|_| !one_by_one) {
+        let expected = format!(
+            "mode = \"reproducible\" and run.walks_per_round = 1: the mixture can be restarted for each {each} only if walks follow one \
+             another"
+        );
+        return wrong("calm.update", found, expected);
     }
     if calm.update != UpdateProtocol::Never && calm.artifact.is_none() {
         let expected = "the gmm_artifacts.npz of the model: an export alone has no scatter matrices and counts, so its \

@@ -195,7 +195,7 @@ pub static RANGES: [Range; 133] = [
     range("refit.threads", "", [0.0, 1024.0], [0.0, 512.0], ""),
     range("refit.method.native.epochs", "", [0.0, 1e9], [1.0, 1e4], ""),
     range("refit.method.native.batch_size", "", [0.0, 1e6], [1.0, 256.0], ""),
-    range("refit.method.native.learning_rate", "", [0.0, 1.0], [1e-6, 0.05], ""),
+    range("refit.method.native.learning_rate", "", [0.0, 1.0], [1e-6, 0.1], ""),
     range("refit.method.native.huber_delta", "", [0.0, 1e3], [1e-4, 1.0], ""),
     range("refit.method.native.patience", "", [0.0, 1e9], [1.0, 1e3], ""),
     range("refit.method.command.time_limit", TIME, [1.0, YEAR], [60.0, 30.0 * DAY], ""),

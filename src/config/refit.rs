@@ -104,14 +104,16 @@ pub enum RefitMethod {
 #[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct NativeRefit {
-    /// Number of passes over the training set.
-    pub epochs: NonZeroU64,
+    /// Number of passes over the training set. Default: 40 with `optimiser = "soap"`, 100 with `"adam"`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub epochs: Option<NonZeroU64>,
     /// Number of structures for each update.
     pub batch_size: NonZeroU32,
     /// What turns gradients into steps.
     pub optimiser: Optimiser,
-    /// Learning rate of the first update; it falls by half a cosine.
-    pub learning_rate: Positive,
+    /// Learning rate of the first update; it falls by half a cosine. Default: 0.05 with `optimiser = "soap"`, 0.001 with `"adam"`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub learning_rate: Option<Positive>,
     /// Learning rate of the last update, at most `learning_rate`. Default: a hundredth of it.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("minimum" = 0))]
@@ -215,13 +217,25 @@ impl Default for RefitMethod {
     }
 }
 
+impl NativeRefit {
+    /// Number of passes over the training set.
+    pub fn epochs(&self) -> u64 {
+        self.epochs.map_or(self.optimiser.default_epochs(), NonZeroU64::get)
+    }
+
+    /// Learning rate of the first update.
+    pub fn first_learning_rate(&self) -> f64 {
+        self.learning_rate.map_or(self.optimiser.default_learning_rate(), Positive::get)
+    }
+}
+
 impl Default for NativeRefit {
     fn default() -> Self {
         Self {
-            epochs: defaults::nonzero(100).into(),
+            epochs: None,
             batch_size: defaults::nonzero(8),
             optimiser: Optimiser::default(),
-            learning_rate: defaults::positive(1e-3),
+            learning_rate: None,
             min_learning_rate: None,
             loss: RefitLoss::default(),
             energy_weight: None,
@@ -278,6 +292,6 @@ mod tests {
         let value = serde_json::to_value(config("/a", "")).unwrap();
         assert_eq!(value.get("refit"), None);
         let with = serde_json::to_value(config("/a", "[refit]\nreplay = [\"r\"]\n")).unwrap();
-        assert_eq!(with["refit"]["method"]["native"]["epochs"], 100);
+        assert_eq!(with["refit"]["method"]["native"]["batch_size"], 8);
     }
 }

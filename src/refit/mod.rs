@@ -25,7 +25,7 @@ use monitor::refit_progress::{LABEL_SET, NO_LABELS};
 use potentials::grace::{GraceModel, Threads};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
-use store::{Store, VersionFiles, VersionRecord, VersionState, unix_milliseconds};
+use store::{Store, StoreError, VersionFiles, VersionRecord, VersionState, unix_milliseconds};
 use tokio_util::sync::CancellationToken;
 use upfit::{EnergyDeviations, EnergyZero};
 
@@ -37,7 +37,7 @@ use self::native::{NativeTraining, TrainingReport};
 use self::settings::{RefitSettings, RefitterConfig, TestSet};
 use self::training_set::{FrozenSet, LabelChoice, LabelFile, LabelFiles, kept};
 use crate::atomic_file::{AtomicFile, cannot_write};
-use crate::config::{ControlFrames, NativeRefit, RefitMethod};
+use crate::config::{Config, ControlFrames, NativeRefit, RefitMethod};
 use crate::exit_status::CommandError;
 use crate::file_hash::{hash, verify_hash};
 use crate::output::log_and_warn;
@@ -502,11 +502,20 @@ fn with_label_set(figures: Value, label_set: &str) -> Value {
     figures
 }
 
-/// The figures of a refit that crashes: what its directory has of the labels that it was to train on.
-pub fn figures_of_crashed(campaign: &Path, number: u32) -> Value {
+/// The figures of a refit that crashes: the labels that it was to train on. If it crashed before it wrote them down, those that there
+/// are now, so that later ones are news.
+pub async fn figures_of_crashed(
+    (store, config): (&Store, &Config),
+    campaign: &Path,
+    number: u32,
+) -> Result<Value, StoreError> {
     let path = campaign.join(FOLDER).join(number.to_string()).join("labels.json");
     let labels = fs::read(path).ok().and_then(|bytes| serde_json::from_slice::<LabelFiles>(&bytes).ok());
-    labels.map_or(Value::Null, |labels| with_label_set(Value::Null, &labels.label_set))
+    let label_set = match labels {
+        Some(labels) => labels.label_set,
+        None => schedule::rules(config).split.label_set(store).await?.unwrap_or_default().0,
+    };
+    Ok(with_label_set(Value::Null, &label_set))
 }
 
 /// A message that names the files of this directory by their names.

@@ -181,9 +181,9 @@ fn upfit_settings(native: &NativeRefit, seed: u64, threads: usize) -> UpfitSetti
         weights.stress = native.stress_weight.unwrap_or(weights.stress);
     }
     loss.delta = native.huber_delta.get();
-    let first = native.learning_rate.get();
+    let first = native.first_learning_rate();
     UpfitSettings {
-        epochs: native.epochs.get(),
+        epochs: native.epochs(),
         batch_size: native.batch_size.get() as usize,
         optimiser: native.optimiser,
         loss,

@@ -84,7 +84,7 @@ impl RefitSchedule {
 }
 
 /// The rules of a configuration.
-fn rules(config: &Config) -> RefitRules {
+pub(super) fn rules(config: &Config) -> RefitRules {
     let split = |refit: &RefitSection| LabelSplit {
         held_out: refit.held_out,
         compares_controls: refit.control_frames == ControlFrames::Compare,

@@ -162,7 +162,7 @@ impl<'a> RefitProcess<'a> {
             labels: 0,
             model_hash: String::new(),
             mixture_hash: String::new(),
-            figures: refit::figures_of_crashed(self.run.directory, number),
+            figures: refit::figures_of_crashed((store, &campaign.config), self.run.directory, number).await?,
             seconds: 0.0,
             core_hours: 0.0,
             time: unix_milliseconds(),
@@ -178,6 +178,9 @@ impl<'a> RefitProcess<'a> {
             version.is_some_and(|version| version.number > campaign.version_number())
         };
         if is_newer(schedule.in_force()) {
+            if !superseded.is_cancelled() {
+                log_and_print("a newer version of the potential is registered: the walks with this one end");
+            }
             superseded.cancel();
         } else if is_newer(schedule.newest()) {
             walks_end.cancel();

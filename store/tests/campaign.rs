@@ -4,7 +4,7 @@ use store::{
     CandidateRecord, Commit, ComponentRecord, Decision, Fate, ProcessRecord, Store, StoreError, WalkRecord,
 };
 use wire::messages::{DeclineReason, WalkProgress};
-use wire::{ConstantPressure, Origin, WalkConditions, WalkId};
+use wire::{CellConditions, ConstantPressure, Origin, WalkConditions, WalkId};
 
 use crate::common::*;
 
@@ -330,8 +330,11 @@ async fn conditions_of_walks_are_read_back() {
         group: "hot".into(),
         temperature: 900.0,
         tau: 0.15,
-        volume_ramp: Some((1.0, 0.85)),
-        constant_pressure: Some(ConstantPressure { pressure: 1e4, start_volume: 0.94, cell_bias: true }),
+        cell: CellConditions::ConstantPressure(ConstantPressure {
+            pressure: 1e4,
+            start_volume: 0.94,
+            cell_bias: true,
+        }),
         repeat: 2,
         version: 2,
     };

@@ -167,7 +167,7 @@ impl<'a> RunningWalk<'a> {
             }
         };
         potential.state = state.bias;
-        if assignment.conditions.constant_pressure.is_none() {
+        if assignment.conditions.constant_pressure().is_none() {
             potential.norm_interval = settings.bias_norm_interval;
         }
         let collection = settings.collection.with_threshold_factor(assignment.threshold_factor);
@@ -383,7 +383,7 @@ impl<'a> RunningWalk<'a> {
         if structure.periodic == [false; 3] {
             return 1.0;
         }
-        if self.assignment.conditions.constant_pressure.is_some() {
+        if self.assignment.conditions.constant_pressure().is_some() {
             return md::extent(structure) / self.state.reference_volume;
         }
         let ramp = self.dynamics.checkpoint().cell_motion.ramp();

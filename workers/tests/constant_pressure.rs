@@ -7,7 +7,7 @@ use atoms::{Matrix3, Structure};
 use md::{BarostatSettings, Dynamics, DynamicsSettings, State, Stream};
 use potentials::grace::Grace;
 use wire::messages::{Assignment, AssignmentReport, Outcome, WalkEnd};
-use wire::{Candidate, ConstantPressure, Origin, WalkConditions};
+use wire::{Candidate, CellConditions, ConstantPressure, Origin, WalkConditions};
 use workers::bias::BiasedPotential;
 use workers::cell_bias::CellBiasSettings;
 use workers::settings::WalkSettings;
@@ -23,8 +23,12 @@ fn at_constant_pressure() -> WalkSettings {
 }
 
 fn conditions(start_volume: f64, cell_bias: bool) -> WalkConditions {
-    let constant_pressure = Some(ConstantPressure { pressure: 1.0, start_volume, cell_bias });
-    WalkConditions { temperature: 600.0, tau: 0.15, constant_pressure, ..WalkConditions::default() }
+    at_pressure(ConstantPressure { pressure: 1.0, start_volume, cell_bias })
+}
+
+fn at_pressure(constant: ConstantPressure) -> WalkConditions {
+    let cell = CellConditions::ConstantPressure(constant);
+    WalkConditions { temperature: 600.0, tau: 0.15, cell, ..WalkConditions::default() }
 }
 
 fn from(conditions: WalkConditions, until: u64) -> Assignment {
@@ -219,8 +223,8 @@ fn a_walk_ends_at_a_boundary_of_its_volume() {
 
 #[test]
 fn a_pressure_that_tears_the_cell_apart_ends_the_walk() {
-    let mut torn = from(conditions(1.0, false), 400);
-    torn.conditions.constant_pressure.as_mut().unwrap().pressure = -1e6;
+    let pulled = ConstantPressure { pressure: -1e6, start_volume: 1.0, cell_bias: false };
+    let torn = from(at_pressure(pulled), 400);
     let settings = WalkSettings { reference_steps: 0, ..at_constant_pressure() };
     let outcome = run(&settings, &torn).outcome;
     let Outcome::Ended(WalkEnd::Diverged { reason }) = outcome else { panic!("{outcome:?}") };

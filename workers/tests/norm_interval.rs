@@ -6,7 +6,7 @@ use atoms::{Evaluation, NeighbourList, Potential, Structure, Vec3, cell};
 use md::ThermostatSettings;
 use potentials::grace::{Grace, Threads};
 use wire::messages::{Assignment, Outcome};
-use wire::{ConstantPressure, TracePoint, WalkConditions};
+use wire::{CellConditions, ConstantPressure, TracePoint, WalkConditions};
 use workers::bias::BiasedPotential;
 use workers::settings::WalkSettings;
 use workers::walk::{WalkContext, advance_observed};
@@ -82,7 +82,7 @@ fn the_bias_has_the_norms_that_were_measured_last() {
 fn on_the_slab(interval: u64, trace_interval: u64, last_step: u64) -> (WalkSettings, Assignment) {
     let settings =
         WalkSettings { bias_norm_interval: interval, trace_interval, collection: never(), ..settings() };
-    let conditions = WalkConditions { tau: 0.3, volume_ramp: None, ..conditions() };
+    let conditions = WalkConditions { tau: 0.3, cell: CellConditions::Fixed, ..conditions() };
     (settings, Assignment { conditions, ..assignment(seed_structure("slab-111"), last_step) })
 }
 
@@ -209,8 +209,8 @@ fn walks_at_constant_pressure_measure_always() {
     let walk = |interval: u64| {
         let (settings, mut first) = on_the_slab(interval, 0, 50);
         first.seed_structure = seed_structure("vacancy");
-        first.conditions.constant_pressure =
-            Some(ConstantPressure { pressure: 1.0, start_volume: 1.0, cell_bias: false });
+        let constant = ConstantPressure { pressure: 1.0, start_volume: 1.0, cell_bias: false };
+        first.conditions.cell = CellConditions::ConstantPressure(constant);
         run(&settings, &first).checkpoint
     };
     assert!(walk(1) == walk(5));

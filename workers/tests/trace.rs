@@ -7,7 +7,7 @@ use atoms::{NeighbourList, Vec3, cell};
 use md::{BarostatSettings, Dynamics, DynamicsSettings, State, Stream, ThermostatSettings};
 use potentials::grace::Grace;
 use wire::messages::{Assignment, Outcome};
-use wire::{Origin, TracePoint, WalkConditions};
+use wire::{CellConditions, Origin, TracePoint, WalkConditions};
 use workers::bias::BiasedPotential;
 use workers::settings::WalkSettings;
 use workers::walk::is_same_state;
@@ -27,7 +27,7 @@ fn steady() -> WalkSettings {
 
 /// The first steps of a walk from the slab, whose atoms have forces and a gradient of γ, in a fixed cell.
 fn on_the_slab(tau: f64, last_step: u64) -> Assignment {
-    let conditions = WalkConditions { tau, volume_ramp: None, ..conditions() };
+    let conditions = WalkConditions { tau, cell: CellConditions::Fixed, ..conditions() };
     Assignment { conditions, ..assignment(seed_structure("slab-111"), last_step) }
 }
 

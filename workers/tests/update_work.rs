@@ -63,8 +63,12 @@ fn the_work_of_an_update_is_taken_out_of_the_kinetic_energy() {
 fn the_work_of_the_bias_goes_on_with_the_smaller_velocities() {
     let settings = WalkSettings { thermostat: md::ThermostatSettings::None {}, zbl: None, ..eager() };
     let mut next = assignment(seed_structure("slab-111"), 500);
-    next.conditions =
-        wire::WalkConditions { temperature: 50.0, tau: 1.0, volume_ramp: None, ..next.conditions };
+    next.conditions = wire::WalkConditions {
+        temperature: 50.0,
+        tau: 1.0,
+        cell: wire::CellConditions::Fixed,
+        ..next.conditions
+    };
     for _ in 0..2 {
         let report = run(&settings, &next);
         (next.checkpoint, next.verdict) = (Some(report.checkpoint), Some(Verdict::Accepted));

@@ -12,7 +12,7 @@ use md::{BarostatSettings, LangevinSettings, ThermostatSettings};
 use potentials::grace::{Grace, GraceModel, PullBack, Threads};
 use potentials::{WallSettings, ZblWindow, ZblWindows};
 use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd};
-use wire::{CampaignId, Candidate, Origin, WalkConditions, WalkId};
+use wire::{CampaignId, Candidate, CellConditions, Origin, WalkConditions, WalkId};
 use workers::bias::BiasedPotential;
 use workers::cell_bias::CellBiasSettings;
 use workers::settings::{GuardSettings, WalkSettings};
@@ -80,7 +80,7 @@ pub fn conditions() -> WalkConditions {
     WalkConditions {
         temperature: 600.0,
         tau: 0.15,
-        volume_ramp: Some((1.0, 1.4)),
+        cell: CellConditions::VolumeRamp { from: 1.0, to: 1.4 },
         ..WalkConditions::default()
     }
 }
@@ -153,10 +153,10 @@ fn a_split_assignment_gives_the_same_result() {
 /// It equilibrates there, like a walk from a seed structure of that volume.
 #[test]
 fn a_walk_begins_at_the_volume_of_its_ramp() {
-    let frame = |structure: Structure, ramp: (f64, f64)| {
+    let frame = |structure: Structure, (from, to): (f64, f64)| {
         let settings = settings();
         let mut control = assignment(structure, 120);
-        control.conditions.volume_ramp = Some(ramp);
+        control.conditions.cell = CellConditions::VolumeRamp { from, to };
         (control.origin, control.frame_steps) = (Origin::Control, vec![40]);
         let Outcome::Candidate(frame) = run(&settings, &control).outcome else { panic!("no frame") };
         frame.structure
@@ -372,7 +372,7 @@ fn a_wall_holds_a_cluster_together() {
     cluster.positions.truncate(5);
     let end = |wall: Option<WallSettings>, structure: &Structure, steps: &[u64]| {
         let settings = WalkSettings { wall, collection: never(), ..settings() };
-        let conditions = WalkConditions { temperature: 6000.0, volume_ramp: None, ..conditions() };
+        let conditions = WalkConditions { temperature: 6000.0, cell: CellConditions::Fixed, ..conditions() };
         let mut next = Assignment { conditions, ..assignment(structure.clone(), 0) };
         for last_step in steps {
             next.last_step = *last_step;
@@ -402,7 +402,7 @@ fn a_walk_that_cannot_leave_a_trap_ends() {
     let guard = GuardSettings { min_distances, ..settings().guard };
     let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 0.01").unwrap();
     let settings = WalkSettings { collection, guard, ..settings() };
-    let first = first_of("fcc-100", WalkConditions { volume_ramp: None, ..conditions() });
+    let first = first_of("fcc-100", WalkConditions { cell: CellConditions::Fixed, ..conditions() });
     let reports = whole_walk(&settings, first);
     let last = reports.last().unwrap();
     assert!(
@@ -419,7 +419,7 @@ fn without_rollbacks_a_refused_walk_continues() {
     let guard = GuardSettings { min_distances, rollback: false, ..settings().guard };
     let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 0.01").unwrap();
     let settings = WalkSettings { collection, guard, ..settings() };
-    let first = first_of("fcc-100", WalkConditions { volume_ramp: None, ..conditions() });
+    let first = first_of("fcc-100", WalkConditions { cell: CellConditions::Fixed, ..conditions() });
     let reports = whole_walk(&settings, first);
     let last = reports.last().unwrap();
     assert!(matches!(&last.outcome, Outcome::Ended(WalkEnd::Completed)), "{last:?}");

@@ -12,9 +12,9 @@ use crate::soap::SoapState;
 #[serde(rename_all = "snake_case")]
 pub enum Optimiser {
     /// Adam with AMSGrad.
-    #[default]
     Adam,
     /// Adam in the eigenbases of Shampoo's preconditioners.
+    #[default]
     Soap,
 }
 
@@ -36,6 +36,23 @@ impl Optimiser {
         match self {
             Self::Adam => "adam",
             Self::Soap => "soap",
+        }
+    }
+
+    /// Number of epochs where none is given: what SOAP does in 40 takes Adam five times as many (docs/benchmarks.md).
+    pub fn default_epochs(self) -> u64 {
+        match self {
+            Self::Adam => 100,
+            Self::Soap => 40,
+        }
+    }
+
+    /// Learning rate of the first update where none is given. A step of SOAP has the same size in all directions of an array of
+    /// weights, so its rate is larger.
+    pub fn default_learning_rate(self) -> f64 {
+        match self {
+            Self::Adam => 1e-3,
+            Self::Soap => 0.05,
         }
     }
 

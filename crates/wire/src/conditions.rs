@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 /// The conditions of a walk.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(from = "WrittenConditions", into = "WrittenConditions")]
 pub struct WalkConditions {
     /// Name of its group of walks; empty without groups.
     pub group: String,
@@ -11,16 +12,29 @@ pub struct WalkConditions {
     pub temperature: f64,
     /// Uncertainty-force scale τ at the start of the walk.
     pub tau: f64,
-    /// V/V₀ at the first and at the last biased step; `None` for a fixed cell or one at constant pressure.
-    pub volume_ramp: Option<(f64, f64)>,
-    /// What a walk at constant pressure starts from; `None` at constant volume or with a volume ramp.
-    #[serde(default)]
-    pub constant_pressure: Option<ConstantPressure>,
+    /// What the cell does.
+    pub cell: CellConditions,
     /// Number of the walk among those under the same conditions, from 0. They differ in their random numbers.
     pub repeat: u32,
     /// Version of the potential that drives it: 0 is that of the configuration.
-    #[serde(default)]
     pub version: u32,
+}
+
+/// What the cell of a walk does.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum CellConditions {
+    /// It stays.
+    #[default]
+    Fixed,
+    /// Its volume changes linearly.
+    VolumeRamp {
+        /// V/V₀ at the first biased step.
+        from: f64,
+        /// V/V₀ at the last one.
+        to: f64,
+    },
+    /// It moves under a pressure.
+    ConstantPressure(ConstantPressure),
 }
 
 /// The conditions of a walk at constant pressure.
@@ -32,6 +46,41 @@ pub struct ConstantPressure {
     pub start_volume: f64,
     /// Whether its cell is biased.
     pub cell_bias: bool,
+}
+
+/// The conditions of a walk as they are written: a key for each kind of cell, as in JSON for users.
+#[derive(Serialize, Deserialize)]
+struct WrittenConditions {
+    group: String,
+    temperature: f64,
+    tau: f64,
+    volume_ramp: Option<(f64, f64)>,
+    #[serde(default)]
+    constant_pressure: Option<ConstantPressure>,
+    repeat: u32,
+    #[serde(default)]
+    version: u32,
+}
+
+impl From<WrittenConditions> for WalkConditions {
+    fn from(written: WrittenConditions) -> Self {
+        let WrittenConditions { group, temperature, tau, volume_ramp, constant_pressure, repeat, version } =
+            written;
+        let cell = match (constant_pressure, volume_ramp) {
+            (Some(constant), _) => CellConditions::ConstantPressure(constant),
+            (None, Some((from, to))) => CellConditions::VolumeRamp { from, to },
+            (None, None) => CellConditions::Fixed,
+        };
+        Self { group, temperature, tau, cell, repeat, version }
+    }
+}
+
+impl From<WalkConditions> for WrittenConditions {
+    fn from(conditions: WalkConditions) -> Self {
+        let (volume_ramp, constant_pressure) = (conditions.volume_ramp(), conditions.constant_pressure());
+        let WalkConditions { group, temperature, tau, cell: _, repeat, version } = conditions;
+        Self { group, temperature, tau, volume_ramp, constant_pressure, repeat, version }
+    }
 }
 
 /// Which conditions differ between the walks of a campaign.
@@ -54,7 +103,7 @@ impl VariedConditions {
             group: varied.group || other.group != first.group,
             temperature: varied.temperature || other.temperature != first.temperature,
             tau: varied.tau || other.tau != first.tau,
-            cell: varied.cell || other.cell() != first.cell(),
+            cell: varied.cell || other.cell != first.cell,
             repeat: varied.repeat || other.repeat != first.repeat,
             version: varied.version || other.version != first.version,
         })
@@ -86,25 +135,40 @@ impl VariedConditions {
 impl WalkConditions {
     /// Whether the volume changes.
     pub fn changes_volume(&self) -> bool {
-        let ramp = self.volume_ramp.is_some_and(|(from, to)| from != 1.0 || to != 1.0);
-        ramp || self.constant_pressure.is_some()
+        match self.cell {
+            CellConditions::Fixed => false,
+            CellConditions::VolumeRamp { from, to } => from != 1.0 || to != 1.0,
+            CellConditions::ConstantPressure(_) => true,
+        }
+    }
+
+    /// V/V₀ at the first and at the last biased step, if the volume has a ramp.
+    pub fn volume_ramp(&self) -> Option<(f64, f64)> {
+        match self.cell {
+            CellConditions::VolumeRamp { from, to } => Some((from, to)),
+            _ => None,
+        }
+    }
+
+    /// The conditions of a cell at constant pressure.
+    pub fn constant_pressure(&self) -> Option<ConstantPressure> {
+        match self.cell {
+            CellConditions::ConstantPressure(constant) => Some(constant),
+            _ => None,
+        }
     }
 
     /// What the cell does: `fixed cell`, `V 1 to 1.4`, `1 bar`, `1 bar from V 0.94, biased cell`.
     pub fn cell_in_words(&self) -> String {
-        match (self.constant_pressure, self.volume_ramp) {
-            (Some(ConstantPressure { pressure, start_volume, cell_bias }), _) => {
+        match self.cell {
+            CellConditions::ConstantPressure(ConstantPressure { pressure, start_volume, cell_bias }) => {
                 let start =
                     if start_volume == 1.0 { String::new() } else { format!(" from V {start_volume}") };
                 format!("{pressure} bar{start}{}", if cell_bias { ", biased cell" } else { "" })
             }
-            (None, Some((from, to))) => format!("V {from} to {to}"),
-            (None, None) => "fixed cell".to_owned(),
+            CellConditions::VolumeRamp { from, to } => format!("V {from} to {to}"),
+            CellConditions::Fixed => "fixed cell".to_owned(),
         }
-    }
-
-    fn cell(&self) -> (Option<(f64, f64)>, Option<ConstantPressure>) {
-        (self.volume_ramp, self.constant_pressure)
     }
 }
 
@@ -117,8 +181,7 @@ mod tests {
             group: group.to_owned(),
             temperature,
             tau: 0.15,
-            volume_ramp: Some((1.0, 1.4)),
-            constant_pressure: None,
+            cell: CellConditions::VolumeRamp { from: 1.0, to: 1.4 },
             repeat,
             version: 0,
         }
@@ -133,15 +196,41 @@ mod tests {
             ["600 K, #1", "900 K, #1", "900 K, #2"]
         );
         assert_eq!(VariedConditions::among(&walks[..1]).name("fcc", &walks[0]), "fcc");
-        let other = WalkConditions { volume_ramp: None, tau: 0.3, ..walk("cold", 600.0, 0) };
+        let other = WalkConditions { cell: CellConditions::Fixed, tau: 0.3, ..walk("cold", 600.0, 0) };
         let varied = VariedConditions::among([&walks[0], &other]);
         assert_eq!(varied.name("fcc", &walks[0]), "fcc (hot, V 1 to 1.4, τ 0.15)");
         assert_eq!(varied.name("fcc", &other), "fcc (cold, fixed cell, τ 0.3)");
-        let constant_pressure = ConstantPressure { pressure: 1.0, start_volume: 0.94, cell_bias: true };
-        let pressed = WalkConditions { constant_pressure: Some(constant_pressure), ..other.clone() };
+        let constant = ConstantPressure { pressure: 1.0, start_volume: 0.94, cell_bias: true };
+        let pressed = WalkConditions { cell: CellConditions::ConstantPressure(constant), ..other.clone() };
         let varied = VariedConditions::among([&other, &pressed]);
         assert_eq!(varied.describe(&pressed), "1 bar from V 0.94, biased cell");
         let later = WalkConditions { version: 2, ..walks[0].clone() };
         assert_eq!(VariedConditions::among([&walks[0], &later]).describe(&later), "version 2");
+    }
+
+    /// The JSON that users and stores have.
+    #[test]
+    fn conditions_are_written_with_a_key_for_each_kind_of_cell() {
+        let constant = ConstantPressure { pressure: 1.0, start_volume: 0.94, cell_bias: true };
+        let cells = [
+            (CellConditions::Fixed, r#""volume_ramp":null,"constant_pressure":null"#),
+            (
+                CellConditions::VolumeRamp { from: 1.0, to: 1.4 },
+                r#""volume_ramp":[1.0,1.4],"constant_pressure":null"#,
+            ),
+            (
+                CellConditions::ConstantPressure(constant),
+                r#""volume_ramp":null,"constant_pressure":{"pressure":1.0,"start_volume":0.94,"cell_bias":true}"#,
+            ),
+        ];
+        for (cell, expected) in cells {
+            let conditions = WalkConditions { cell, ..walk("hot", 600.0, 0) };
+            let text = serde_json::to_string(&conditions).unwrap();
+            assert!(text.contains(expected), "{text}");
+            assert_eq!(serde_json::from_str::<WalkConditions>(&text).unwrap(), conditions);
+        }
+        let older = r#"{"group":"","temperature":600.0,"tau":0.15,"volume_ramp":[1.0,0.8],"repeat":0}"#;
+        let older: WalkConditions = serde_json::from_str(older).unwrap();
+        assert_eq!(older.cell, CellConditions::VolumeRamp { from: 1.0, to: 0.8 });
     }
 }

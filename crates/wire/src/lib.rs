@@ -24,7 +24,7 @@ mod walk_trace;
 
 pub use block::{BlockError, Candidate, CandidateBlock, CandidateView};
 pub use completion::{CompletionCoefficients, CompletionPredictors};
-pub use conditions::{ConstantPressure, WalkConditions};
+pub use conditions::{CellConditions, ConstantPressure, WalkConditions};
 pub use device_statistics::DeviceStatistics;
 pub use ids::{CampaignId, CandidateId, ContentHash, IdError, Origin, WalkId};
 pub use mixture::{MixtureReader, SharedMixture, SharedMixtureError};

@@ -408,10 +408,16 @@ impl DecisionState {
         commit.decisions.push(self.decision("ended", id, detail));
     }
 
-    /// Whether the next biased walk starts from another seed structure, and so from the original mixture.
+    /// Whether the biased walk after one of this seed structure starts from the original mixture.
     fn restarts_mixture_after(&self, seed_structure: u32) -> bool {
-        let next = self.walks.unfinished(true).next().map(|id| self.walks[id].record.seed_structure);
-        self.settings.update == UpdateProtocol::PerSeedStructure && next != Some(seed_structure)
+        match self.settings.update {
+            UpdateProtocol::Cumulative | UpdateProtocol::Never => false,
+            UpdateProtocol::PerSeedStructure => {
+                let next = self.walks.unfinished(true).next();
+                next.map(|id| self.walks[id].record.seed_structure) != Some(seed_structure)
+            }
+            UpdateProtocol::PerWalk => true,
+        }
     }
 
     /// Ends the unassigned biased walks if all have to end, or those whose seed structure has its maximum number of structures.

@@ -262,6 +262,9 @@ impl Replay {
                 /// Campaigns of early versions have the same conditions in all walks.
                 #[serde(default)]
                 conditions: WalkConditions,
+                /// The selectors of earlier versions had no bound.
+                #[serde(default)]
+                max_grade: Option<f64>,
             },
             Control {
                 control_of: WalkId,
@@ -270,7 +273,8 @@ impl Replay {
         // With other rules there are no control walks, but walks keep their numbers from the log.
         let id = if self.is_exact() { self.decisions.next_walk_id() } else { walk(recorded)? };
         match read(recorded)? {
-            StartDetail::Biased { seed_structure: name, conditions } => {
+            StartDetail::Biased { seed_structure: name, conditions, max_grade } => {
+                self.decisions.settings.max_grade = max_grade;
                 let seed = self.seed_structures.get(&name).copied();
                 let seed =
                     seed.ok_or_else(|| damaged(recorded, &format!("there is no seed structure '{name}'")))?;

@@ -27,14 +27,16 @@ impl CampaignMode {
     }
 }
 
-/// What happens to the mixture between seed structures.
+/// What happens to the mixture between walks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum UpdateProtocol {
-    /// Updates accumulate over all seed structures.
+    /// Updates accumulate over all walks.
     Cumulative,
     /// Each seed structure starts from the original mixture.
     PerSeedStructure,
+    /// Each walk starts from the original mixture.
+    PerWalk,
     /// The mixture is never updated.
     Never,
 }
@@ -74,7 +76,7 @@ pub struct SelectorSettings {
     pub walks_per_round: usize,
     /// Number of steps in an assignment.
     pub steps_per_assignment: u64,
-    /// What happens to the mixture between seed structures.
+    /// What happens to the mixture between walks.
     pub update: UpdateProtocol,
     /// How the covariance is updated, and when the search for α stops.
     pub search: calm::UpdateSettings,

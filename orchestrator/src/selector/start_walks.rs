@@ -101,7 +101,11 @@ impl DecisionState {
         name: &str,
         conditions: WalkConditions,
     ) -> Decision {
-        let detail = json!({ "seed_structure": name, "conditions": conditions });
+        let mut detail = json!({ "seed_structure": name, "conditions": conditions });
+        // Earlier versions of calmwalk did not test it: what the log has is what held.
+        if let Some(bound) = self.settings.max_grade {
+            detail["max_grade"] = bound.into();
+        }
         self.walks.insert(Walk::new(id, seed as u32, conditions, self.settings.steps_per_assignment));
         self.decision("begun", id, detail)
     }

@@ -104,6 +104,7 @@ pub fn any_settings() -> impl Strategy<Value = SelectorSettings> {
     let update = prop::sample::select(vec![
         UpdateProtocol::Cumulative,
         UpdateProtocol::PerSeedStructure,
+        UpdateProtocol::PerWalk,
         UpdateProtocol::Never,
     ]);
     let limits = (
@@ -117,7 +118,10 @@ pub fn any_settings() -> impl Strategy<Value = SelectorSettings> {
         |(walks, update, limits, control, declined_feature_bytes, on_forgetting)| {
             let (max_per_walk, max_per_seed_structure, total, max_steps_without_structure) = limits;
             SelectorSettings {
-                walks_per_round: if update == UpdateProtocol::PerSeedStructure { 1 } else { walks },
+                walks_per_round: match update {
+                    UpdateProtocol::PerSeedStructure | UpdateProtocol::PerWalk => 1,
+                    UpdateProtocol::Cumulative | UpdateProtocol::Never => walks,
+                },
                 update,
                 max_per_walk,
                 max_per_seed_structure,

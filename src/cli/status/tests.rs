@@ -126,8 +126,7 @@ fn status() -> CampaignStatus {
         gamma_max: Some(123.45),
         steps_per_second: Some(1234.5),
         conditions: Some(WalkConditions {
-            volume_ramp: Some((1.0, 1.4)),
-            constant_pressure: Some(wire::ConstantPressure {
+            cell: wire::CellConditions::ConstantPressure(wire::ConstantPressure {
                 pressure: 1.0,
                 start_volume: 1.0,
                 cell_bias: true,

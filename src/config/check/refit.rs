@@ -126,7 +126,7 @@ fn check_native(native: &NativeRefit) -> Vec<Result<(), InvalidValue>> {
 }
 
 fn check_last_learning_rate(native: &NativeRefit) -> Result<(), InvalidValue> {
-    let first = native.learning_rate.get();
+    let first = native.first_learning_rate();
     match native.min_learning_rate {
         Some(last) if !(0.0..=first).contains(&last) => {
             let expected = format!("0 to refit.method.native.learning_rate = {first}");
@@ -264,7 +264,7 @@ mod tests {
             ),
             (
                 "method = { native = { min_learning_rate = 0.1 } }",
-                "refit.method.native.min_learning_rate is 0.1; expected 0 to refit.method.native.learning_rate = 0.001",
+                "refit.method.native.min_learning_rate is 0.1; expected 0 to refit.method.native.learning_rate = 0.05",
             ),
             (
                 "method = { native = { min_learning_rate = -1.0 } }",

@@ -9,7 +9,7 @@ use md::{BarostatSettings, LangevinSettings, NoseHooverSettings, ThermostatSetti
 use potentials::grace::{GraceModel, Threads};
 use potentials::{ZblWindow, ZblWindows};
 use wire::messages::{Assignment, AssignmentReport, Outcome};
-use wire::{CampaignId, Candidate, ConstantPressure, Origin, WalkConditions, WalkId};
+use wire::{CampaignId, Candidate, CellConditions, ConstantPressure, Origin, WalkConditions, WalkId};
 use workers::cell_bias::CellBiasSettings;
 use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
@@ -130,10 +130,10 @@ fn settings(threshold: f64, ensemble: Ensemble) -> WalkSettings {
 }
 
 fn assignment(seed_structure: Structure, ensemble: Ensemble, until: u64) -> Assignment {
-    let (volume_ramp, constant_pressure) = match ensemble {
-        Ensemble::ConstantVolume => (Some((1.0, 1.0)), None),
+    let cell = match ensemble {
+        Ensemble::ConstantVolume => CellConditions::VolumeRamp { from: 1.0, to: 1.0 },
         Ensemble::ConstantPressure { cell_bias } => {
-            (None, Some(ConstantPressure { pressure: 1.0, start_volume: 1.0, cell_bias }))
+            CellConditions::ConstantPressure(ConstantPressure { pressure: 1.0, start_volume: 1.0, cell_bias })
         }
     };
     Assignment {
@@ -143,13 +143,7 @@ fn assignment(seed_structure: Structure, ensemble: Ensemble, until: u64) -> Assi
         origin: Origin::Biased,
         random_walk: WalkId(0),
         seed_structure,
-        conditions: WalkConditions {
-            temperature: 600.0,
-            tau: 0.15,
-            volume_ramp,
-            constant_pressure,
-            ..WalkConditions::default()
-        },
+        conditions: WalkConditions { temperature: 600.0, tau: 0.15, cell, ..WalkConditions::default() },
         checkpoint: None,
         verdict: None,
         last_step: until,

@@ -22,7 +22,7 @@ pub(super) fn start_reference_run(
     assignment: &Assignment,
     potential: &mut BiasedPotential,
 ) -> Result<Option<Dynamics>, WalkError> {
-    let Some(constant) = assignment.conditions.constant_pressure.filter(|_| settings.reference_steps > 0)
+    let Some(constant) = assignment.conditions.constant_pressure().filter(|_| settings.reference_steps > 0)
     else {
         return Ok(None);
     };
@@ -62,7 +62,7 @@ pub(super) fn cell_bias(
     assignment: &Assignment,
     potential: &mut BiasedPotential,
 ) -> Result<Option<CellBias>, WalkError> {
-    let is_biased = assignment.conditions.constant_pressure.is_some_and(|constant| constant.cell_bias);
+    let is_biased = assignment.conditions.constant_pressure().is_some_and(|constant| constant.cell_bias);
     if !is_biased || assignment.origin == Origin::Control {
         return Ok(None);
     }
@@ -126,7 +126,7 @@ impl RunningWalk<'_> {
 
     /// Lets a barostat move the cell from the first step after equilibration on.
     pub(super) fn release_cell(&mut self) -> Result<(), WalkError> {
-        let Some(constant) = self.assignment.conditions.constant_pressure else { return Ok(()) };
+        let Some(constant) = self.assignment.conditions.constant_pressure() else { return Ok(()) };
         if *self.cell_motion() == CellMotion::Fixed {
             let volume = Some(self.state.reference_volume);
             let structure = self.dynamics.structure();
@@ -144,7 +144,7 @@ impl RunningWalk<'_> {
     /// V₀ of a walk at constant pressure, once it is known.
     pub(super) fn reference_volume(&self) -> Option<f64> {
         let is_known =
-            self.assignment.conditions.constant_pressure.is_some() && self.state.reference_run.is_none();
+            self.assignment.conditions.constant_pressure().is_some() && self.state.reference_run.is_none();
         is_known.then_some(self.state.reference_volume)
     }
 

@@ -20,7 +20,7 @@ pub(super) fn start_dynamics(
     let conditions = &assignment.conditions;
     let stream = Stream::new(settings.rng_seed, assignment.random_walk.0, 0);
     let mut start = State::thermal(structure, conditions.temperature, &stream);
-    let ramp = conditions.volume_ramp.map(|(from, to)| {
+    let ramp = conditions.volume_ramp().map(|(from, to)| {
         let ramp = VolumeRamp::new(&start, from, to, settings.biased_steps);
         VolumeRamp { start: settings.equilibration_steps, ..ramp }
     });
@@ -29,7 +29,7 @@ pub(super) fn start_dynamics(
         ramp.apply(&mut start.structure, 0);
     }
     // Likewise, the barostat moves the cell only afterwards.
-    if let Some(constant) = conditions.constant_pressure {
+    if let Some(constant) = conditions.constant_pressure() {
         let ratio = constant.start_volume * reference_volume / md::extent(&start.structure);
         if ratio != 1.0 {
             md::scale_volume(&mut start.structure, ratio);

@@ -9,7 +9,7 @@ use proptest::prelude::*;
 use super::common::{candidate, origin, usable_structure};
 use super::encode_message;
 use crate::block::Candidate;
-use crate::conditions::{ConstantPressure, WalkConditions};
+use crate::conditions::{CellConditions, ConstantPressure, WalkConditions};
 use crate::ids::{CampaignId, Origin, WalkId};
 use crate::messages::{
     Assignment, AssignmentReport, AssignmentStart, DeclineReason, Outcome, Verdict, WalkEnd, WalkProgress,
@@ -97,20 +97,17 @@ pub fn assignment() -> impl Strategy<Value = Assignment> {
 }
 
 fn conditions() -> impl Strategy<Value = WalkConditions> {
-    let ramp = option::of((0.1..9.0, 0.1..9.0));
-    let pressure = (-1e5..1e5, 0.1..9.0, any::<bool>());
-    let pressure = option::of(pressure.prop_map(|(pressure, start_volume, cell_bias)| ConstantPressure {
-        pressure,
-        start_volume,
-        cell_bias,
-    }));
-    ("[a-z]{0,9}", 1.0..9000.0, 0.0..9.0, ramp, pressure, any::<u32>(), any::<u32>()).prop_map(
-        |(group, temperature, tau, volume_ramp, constant_pressure, repeat, version)| WalkConditions {
+    let ramp = (0.1..9.0, 0.1..9.0).prop_map(|(from, to)| CellConditions::VolumeRamp { from, to });
+    let constant = (-1e5..1e5, 0.1..9.0, any::<bool>()).prop_map(|(pressure, start_volume, cell_bias)| {
+        CellConditions::ConstantPressure(ConstantPressure { pressure, start_volume, cell_bias })
+    });
+    let cell = prop_oneof![Just(CellConditions::Fixed), ramp, constant];
+    ("[a-z]{0,9}", 1.0..9000.0, 0.0..9.0, cell, any::<u32>(), any::<u32>()).prop_map(
+        |(group, temperature, tau, cell, repeat, version)| WalkConditions {
             group,
             temperature,
             tau,
-            volume_ramp,
-            constant_pressure,
+            cell,
             repeat,
             version,
         },
