@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 use wire::{Origin, WalkId};
 
 use crate::forgetting::{AlarmState, ForgettingMeasurement, ForgettingRule};
-use crate::output::{count, print_stderr};
+use crate::output::{count, decimals, print_stderr};
 use crate::wording::walk_ends;
 
 /// Interval between plain lines that only report steps.
@@ -116,14 +116,22 @@ impl RunDisplay {
         }
         for candidate in &commit.candidates {
             let view = candidate.block.view();
-            let (id, gamma_max) = (view.id(), calm::grade::maximum(view.gamma));
+            let id = view.id();
+            let largest = |grades: &store::records::AtomGrades| {
+                decimals(grades.gamma.iter().copied().reduce(f64::max), 2)
+            };
+            let [current, original] = [&candidate.selector, &candidate.original].map(largest);
             let what = match candidate.fate {
                 Fate::Accepted if view.origin() == Origin::Control => "control frame".to_owned(),
                 Fate::Accepted => "accepted".to_owned(),
                 Fate::Declined(reason) => format!("declined ({})", reason.name().replace('_', " ")),
             };
             self.accepted += u64::from(candidate.fate == Fate::Accepted && view.origin() == Origin::Biased);
-            self.show(&format!("{}: step {}, γ_max {gamma_max:.2}, {what}", self.name(id.walk), id.step));
+            self.show(&format!(
+                "{}: step {}, γ_max {current}, γ₀_max {original}, {what}",
+                self.name(id.walk),
+                id.step
+            ));
         }
         for decision in commit.decisions.iter().filter(|decision| decision.kind == "left_out") {
             let (step, error) =

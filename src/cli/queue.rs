@@ -209,8 +209,18 @@ fn write_list(
             offset => writeln!(out, "no {state}jobs after the first {offset}"),
         };
     }
-    let mut titles =
-        vec!["id", "state", ">priority", ">atoms", "formula", ">γ_max", ">attempts", ">failed", "protocol"];
+    let mut titles = vec![
+        "id",
+        "state",
+        ">priority",
+        ">atoms",
+        "formula",
+        ">γ_max",
+        ">γ₀_max",
+        ">attempts",
+        ">failed",
+        "protocol",
+    ];
     let have_values = jobs.iter().any(|job| job.value.is_some());
     titles.extend(have_values.then_some(">value"));
     titles.extend((!versions.is_single()).then_some(">version"));
@@ -222,6 +232,7 @@ fn write_list(
             job.priority.to_string(),
             job.atoms.to_string(),
             job.formula.clone(),
+            decimals(job.selector_gamma, 2),
             decimals(job.original_gamma, 2),
             job.attempts.to_string(),
             job.failures.to_string(),
@@ -250,6 +261,7 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
         expires,
         atoms,
         formula,
+        selector_gamma,
         original_gamma,
         relabel,
         value,
@@ -274,7 +286,8 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
         writeln!(out, "  leased by {holder}, lease expires in {left} s")?;
     }
     writeln!(out, "  atoms     {atoms}, {formula}")?;
-    writeln!(out, "  γ_max     {} (original mixture)", decimals(*original_gamma, 3))?;
+    let [current, original] = [*selector_gamma, *original_gamma].map(|gamma| decimals(gamma, 3));
+    writeln!(out, "  γ_max     {current} at the decision; γ₀_max {original} (original mixture)")?;
     for ((status, energy), adjustments) in details.energies.iter().zip(&details.retry_adjustments) {
         let status = format!("{status:?}").to_lowercase();
         let per_atom = energy / f64::from(*atoms);
@@ -352,6 +365,7 @@ mod tests {
             failures: 0,
             atoms: 54,
             formula: "Mo54".into(),
+            selector_gamma: Some(1.4),
             original_gamma: Some(1.5),
             original_gamma_nbr: None,
             origin: "biased".into(),

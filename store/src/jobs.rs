@@ -125,6 +125,8 @@ pub struct QueueEntry {
     pub atoms: u32,
     /// Formula.
     pub formula: String,
+    /// Largest γ under the selector's mixture at the decision, before the update.
+    pub selector_gamma: Option<f64>,
     /// Largest γ under the original mixture.
     pub original_gamma: Option<f64>,
     /// Largest γ_nbr under the original mixture.

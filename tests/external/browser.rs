@@ -234,7 +234,7 @@ fn table(browser: &Browser, page: &str) {
     // Sort with the keyboard; the focus stays on the button.
     browser.run("document.querySelector('button.sort[data-keep=gamma]').focus()");
     browser.press(&[ENTER]);
-    browser.wait("document.querySelector('th[aria-sort=descending]')?.textContent.includes('γ_max')");
+    browser.wait("document.querySelector('th[aria-sort=descending]')?.textContent.includes('γ₀_max')");
     assert_eq!(browser.run("return document.activeElement.dataset.keep"), "gamma");
     let found: Vec<f64> = serde_json::from_value(browser.run(&format!("return {column}"))).unwrap();
     assert!(found.len() > 2 && found.is_sorted_by(|a, b| a >= b), "{found:?}");

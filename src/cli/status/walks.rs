@@ -13,8 +13,18 @@ use crate::output::{TextTable, decimals};
 pub const NAME: usize = 14;
 
 /// Titles of the columns in the format of [`TextTable::new`].
-pub const TITLES: [&str; 9] =
-    [">walk", "seed structure", "state", ">step", ">steps/s", ">T (K)", ">V/V₀", ">γ_max", ">taken"];
+pub const TITLES: [&str; 10] = [
+    ">walk",
+    "seed structure",
+    "state",
+    ">step",
+    ">steps/s",
+    ">T (K)",
+    ">V/V₀",
+    ">γ_max",
+    ">γ₀_max",
+    ">taken",
+];
 
 /// Selects at most `most` walks, in order of their numbers: running walks with the largest γ first, then those that started
 /// last.
@@ -74,6 +84,7 @@ pub fn line(walk: &WalkStatus, varied: &VariedConditions, run_active: bool, name
         decimals(walk.temperature, 0),
         decimals(walk.relative_volume, 3),
         decimals(walk.gamma_max, 2),
+        decimals(walk.gamma_max_original, 2),
         walk.accepted.to_string(),
     ]
 }

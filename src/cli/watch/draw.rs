@@ -210,7 +210,7 @@ fn draw_charts(frame: &mut Frame<'_>, area: Rect, state: &WatchState, theme: &Th
     let spread = charts
         .gamma()
         .map_or(String::new(), |(median, largest)| format!(": median {median:.2}, max {largest:.1}"));
-    let title = format!("γ_max of {}{spread}", charts.candidates());
+    let title = format!("γ₀_max of {}{spread}", charts.candidates());
     draw_chart(frame, left, &title, &counts, None, &axis(left.width, end), theme);
     let (shares, group) = charts.acceptance_history(right.width.into());
     let title = match charts.acceptance() {

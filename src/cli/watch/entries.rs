@@ -12,12 +12,21 @@ use crate::filter::{self, StructureFilter, StructureProperties};
 use crate::output::decimals;
 
 /// Columns of the queue: `>` marks numbers, trailing blanks reserve width.
-pub const JOBS: [&str; 7] =
-    ["candidate                 ", "state   ", ">priority", ">atoms", "formula  ", ">γ_max", ">tries"];
+pub const JOBS: [&str; 8] =
+    ["candidate         ", "state   ", ">prio", ">atoms", "formula", ">γ_max", ">γ₀_max", ">tries"];
 
 /// Columns of the decisions.
-pub const DECISIONS: [&str; 8] =
-    [">number", "what               ", ">walk", "seed structure", ">   step", ">T (K)", ">V/V₀", ">γ_max"];
+pub const DECISIONS: [&str; 9] = [
+    ">number",
+    "what             ",
+    ">walk",
+    "seed structure",
+    ">   step",
+    ">T (K)",
+    ">V/V₀",
+    ">γ_max",
+    ">γ₀_max",
+];
 
 /// Quantities that are not available in a pane: of walks, of label jobs, of decisions.
 pub const UNKNOWN_QUANTITIES: [&[&str]; 3] = [
@@ -80,11 +89,12 @@ pub fn job_entries(
     let entry = |job: &QueueEntry| PaneEntry {
         key: job.job.to_string(),
         columns: vec![
-            without_campaign(&job.candidate).to_owned(),
+            short_candidate(&job.candidate),
             job.state.to_string(),
             job.priority.to_string(),
             job.atoms.to_string(),
-            cut(&job.formula, 12),
+            cut(&job.formula, 9),
+            decimals(job.selector_gamma, 2),
             decimals(job.original_gamma, 2),
             job.attempts.to_string(),
         ],
@@ -132,6 +142,7 @@ fn decision_entry(decision: &RecentDecision) -> PaneEntry {
             step.map_or(String::new(), |step| step.to_string()),
             number(|found| found.temperature, 0),
             number(|found| found.relative_volume, 3),
+            number(|found| found.selector_gamma, 2),
             number(|found| found.original_gamma, 2),
         ],
         tone: match kind.as_str() {
@@ -148,9 +159,16 @@ pub fn without_campaign(candidate: &str) -> &str {
     candidate.split_once('-').map_or(candidate, |(_, rest)| rest)
 }
 
+/// Walk, segment and step of a candidate, with eight digits of its hash.
+fn short_candidate(candidate: &str) -> String {
+    let rest = without_campaign(candidate);
+    rest.rsplit_once('-').map_or(rest.to_owned(), |(place, hash)| format!("{place}-{}", hash.get(..8).unwrap_or(hash)))
+}
+
 fn facts_of_walk(walk: &WalkStatus) -> StructureProperties<'_> {
     StructureProperties {
-        gamma: walk.gamma_max,
+        gamma: walk.gamma_max_original,
+        gamma_current: walk.gamma_max,
         relative_volume: walk.relative_volume,
         kinetic_temperature: walk.temperature,
         conditions: walk.conditions.as_ref(),
@@ -174,6 +192,7 @@ fn facts_of_job<'a>(
 ) -> StructureProperties<'a> {
     StructureProperties {
         gamma: job.original_gamma,
+        gamma_current: job.selector_gamma,
         gamma_nbr: job.original_gamma_nbr,
         relative_volume: job.relative_volume,
         kinetic_temperature: job.temperature,
@@ -201,6 +220,7 @@ fn facts_of_decision<'a>(
     let Some(found) = &decision.candidate else { return of_walk };
     StructureProperties {
         gamma: found.original_gamma,
+        gamma_current: found.selector_gamma,
         gamma_nbr: found.original_gamma_nbr,
         relative_volume: found.relative_volume,
         kinetic_temperature: found.temperature,

@@ -29,7 +29,8 @@ d                drop it;  t  retry it, if it failed or was dropped
 
 q                quit, or close a text; Ctrl-C quits at once
 
-γ_max of a walk is that of its last graded step; in the queue, decisions and distribution it is under the original mixture.
+γ_max is under the current mixture: of a walk, that of its last graded step; of a candidate, that at the decision. γ₀_max is under the
+original mixture: of a walk, at the last point of its trace. Filters call them gamma_current and gamma.
 Changes are recorded in the operations log, as those by commands. In reproducible mode the other walks of the same round wait for a
 paused walk.";
 

@@ -72,7 +72,7 @@ function downloads({ id }) {
 function graded(grades) {
   const columns = [["mixture"], ["version", true], ["γ_max", true], ["γ_nbr, largest", true], ["atoms with γ > 1", true]];
   const row = (name, grade) => [name, whole(grade.mixture_version), decimals(grade.gamma_max, 3), decimals(grade.gamma_nbr_max, 3), whole(grade.atoms_above_1)];
-  const rows = [row("walker", grades.walker), row("selector, at the decision", grades.selector), row("original", grades.original)];
+  const rows = [row("walker", grades.walker), row("selector, at the decision", grades.selector), row("original (γ₀)", grades.original)];
   const { trigger } = grades;
   return element("div", {}, table("Grades under three mixtures", columns, rows), facts([
     ["staleness", `the walker's mixture was ${whole(grades.staleness)} versions behind`],
@@ -107,11 +107,11 @@ function trace(found, grades, signal) {
   const draw = (offered) => {
     const before = offered.filter((one) => one.segment === found.segment && one.step <= found.step);
     const points = (key) => before.filter((one) => one[key] != null).map((one) => [one.step, one[key]]);
-    const marks = (key, shape, k) => ({ name: key === "gamma" ? "original mixture" : "the walker's mixture", shape, colour: LINES[k],
+    const marks = (key, shape, k) => ({ name: key === "gamma" ? "γ₀_max, original mixture" : "γ_max, the walker's mixture", shape, colour: LINES[k],
       points: before.filter((one) => one[key] != null).map((one) => [one.step, one[key], `#candidate/${encodeURIComponent(one.id)}`,
         `step ${one.step}: ${words(one.fate)}`]) });
     place.replaceChildren(plot({ title: `Walk ${found.walk}, segment ${found.segment}: earlier candidates`,
-      x: { title: "step" }, y: { title: "γ_max", least: 0 },
+      x: { title: "step" }, y: { title: "γ_max, γ₀_max", least: 0 },
       lines: [{ colour: LINES[0], points: points("gamma") }, { colour: LINES[1], dash: DASHES[1], points: points("walker_gamma") }],
       marks: [marks("gamma", "circle", 0), marks("walker_gamma", "diamond", 1)] }));
   };

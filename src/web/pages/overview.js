@@ -17,7 +17,7 @@ const WALKS = 40;
 const ELEMENTS = 4;
 
 const WALK_COLUMNS = [["walk", true], ["seed structure"], ["origin"], ["state"], ["step", true], ["T", true], ["V/V₀", true],
-  ["γ_max", true], ["τ", true], ["steps/s", true], ["accepted", true], ["rejected", true]];
+  ["γ_max", true], ["γ₀_max", true], ["τ", true], ["steps/s", true], ["accepted", true], ["rejected", true]];
 
 export function show(content, _, signal) {
   const tiles = element("div", { class: "tiles" });
@@ -177,6 +177,7 @@ function walks({ walks: all, run_active }, changed) {
   const rows = order.slice(0, WALKS).map((walk) => [
     element("a", { href: `#walk/${walk.walk}`, "data-keep": `walk-${walk.walk}` }, whole(walk.walk)), walk.seed_structure, walk.origin, sentence(state(stateOf(walk, run_active)), walk.reason && ` ${walk.reason}`),
     whole(walk.reference_step ?? walk.step), decimals(walk.temperature, 0, "K"), decimals(walk.relative_volume, 4), decimals(walk.gamma_max, 2),
+    decimals(walk.gamma_max_original, 2),
     digits(walk.tau), digits(walk.steps_per_second), whole(walk.accepted), whole(walk.rejected), ...(changed ? [button(walk) || ""] : [])]);
   const more = all.length - rows.length;
   const [going, paused] = [all.filter((walk) => isUnderWay(walk) && !walk.paused), all.filter((walk) => walk.paused)];

@@ -75,5 +75,5 @@ function newestCandidates(newest) {
   const marks = Object.entries(FATES).map(([name, look]) => ({ name: words(name), ...look,
     points: newest.filter((one) => fate(one) === name && one.gamma != null && one.relative_volume != null).map(point) }));
   return plot({ title: `Grade and volume of the newest ${NEWEST} candidates`, x: { title: "V/V₀" },
-    y: { title: "γ_max (original mixture)", least: 0 }, marks: marks.filter((kind) => kind.points.length > 0) });
+    y: { title: "γ₀_max", least: 0 }, marks: marks.filter((kind) => kind.points.length > 0) });
 }
