@@ -155,6 +155,13 @@ pub struct QueueEntry {
     pub excluded: Option<String>,
 }
 
+impl Attempt {
+    /// Whether it ended with a result.
+    pub fn made_label(&self) -> bool {
+        matches!(self.outcome.as_deref(), Some("labelled" | "check"))
+    }
+}
+
 /// An attempt at a job.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Attempt {

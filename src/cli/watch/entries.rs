@@ -6,7 +6,7 @@ use wire::WalkConditions;
 use wire::conditions::VariedConditions;
 
 use super::pane::{PaneEntry, Tone};
-use crate::cli::status::page::cut;
+use crate::cli::status::page::{cut, cut_middle};
 use crate::cli::status::walks;
 use crate::filter::{self, StructureFilter, StructureProperties};
 use crate::output::decimals;
@@ -61,9 +61,10 @@ pub fn walk_entries(
         _ => Tone::Ended,
     };
     let varied = VariedConditions::among(walks.iter().filter_map(|walk| walk.conditions.as_ref()));
+    let width = walks::width_of_names(walks);
     let entry = |walk: &WalkStatus| PaneEntry {
         key: walk.walk.to_string(),
-        columns: walks::line(walk, &varied, run_active, walks::NAME),
+        columns: walks::line(walk, &varied, run_active, width),
         tone: tone(walk),
         candidate: None,
     };
@@ -115,10 +116,12 @@ pub fn decision_entries<'a>(
         let species = filter::species(formula);
         filter.is_none_or(|filter| filter.matches(&facts_of_decision(decision, &species, walks)))
     };
-    decisions.filter(matches).map(decision_entry).collect()
+    let width = walks::width_of_names(walks);
+    decisions.filter(matches).map(|decision| decision_entry(decision, width)).collect()
 }
 
-fn decision_entry(decision: &RecentDecision) -> PaneEntry {
+/// `width`: that of names of seed structures.
+fn decision_entry(decision: &RecentDecision, width: usize) -> PaneEntry {
     let RecentDecision { sequence, kind, walk, detail, candidate, .. } = decision;
     let found = candidate.as_ref();
     let number = |of: fn(&DecidedCandidate) -> Option<f64>, digits| match found {
@@ -138,7 +141,7 @@ fn decision_entry(decision: &RecentDecision) -> PaneEntry {
             sequence.to_string(),
             what,
             walk.map_or(String::new(), |walk| walk.to_string()),
-            cut(name.unwrap_or_default(), walks::NAME),
+            cut_middle(name.unwrap_or_default(), width),
             step.map_or(String::new(), |step| step.to_string()),
             number(|found| found.temperature, 0),
             number(|found| found.relative_volume, 3),
@@ -162,7 +165,8 @@ pub fn without_campaign(candidate: &str) -> &str {
 /// Walk, segment and step of a candidate, with eight digits of its hash.
 fn short_candidate(candidate: &str) -> String {
     let rest = without_campaign(candidate);
-    rest.rsplit_once('-').map_or(rest.to_owned(), |(place, hash)| format!("{place}-{}", hash.get(..8).unwrap_or(hash)))
+    rest.rsplit_once('-')
+        .map_or(rest.to_owned(), |(place, hash)| format!("{place}-{}", hash.get(..8).unwrap_or(hash)))
 }
 
 fn facts_of_walk(walk: &WalkStatus) -> StructureProperties<'_> {

@@ -3,7 +3,7 @@
 import { canPause, pauseButton } from "./actions.js";
 import { listen } from "./api.js";
 import { element, facts, renew, section, sentence, state, table, words } from "./dom.js";
-import { bytes, decimals, digits, duration, percent, time, whole } from "./format.js";
+import { bytes, coreTime, counted, decimals, digits, duration, percent, time, whole } from "./format.js";
 import { overTime } from "./plots.js";
 import { campaignState } from "./campaign_state.js";
 import { versions } from "./versions.js";
@@ -60,18 +60,18 @@ function summary(status) {
   return [
     tile("Campaign", state(how), `${status.campaign.slice(0, 8)}, ${status.mode} mode`,
       status.round > 0 ? `round ${whole(status.round)}` : "", `${bytes(status.disk.bytes)} on disk`),
-    tile("Walks", `${whole(underWay)} ${status.run_active ? "running" : "unfinished"}`, ended(status.ends, walks.length - underWay),
+    tile("Walks", underWay > 0 || walks.length === 0 ? `${whole(underWay)} ${status.run_active ? "running" : "unfinished"}` : `${whole(walks.length)} ended`,
+      underWay > 0 || hasEarlyEnds(status.ends) ? ended(status.ends, walks.length - underWay) : "",
       status.steps_per_second == null ? "" : `${digits(status.steps_per_second)} steps/s in all`),
     tile("Candidates", `${whole(candidates.accepted)} accepted`,
       `of ${whole(candidates.seen)} seen (${percent(share(candidates.accepted, candidates.seen))})`,
-      declined && `declined: ${declined}`, `${whole(candidates.control)} control frames`,
+      declined && `declined: ${declined}`, candidates.control > 0 && counted(candidates.control, "control frame"),
       candidates.left_out > 0 && `${whole(candidates.left_out)} left out (could not be graded, or control frames with atoms too close)`,
       status.shared_structures > 0 && `${whole(status.shared_structures)} of them identical to structures of their biased walks`),
-    tile("Labels", `${whole(labels.labelled)} made`, `${whole(labels.queued)} queued, ${whole(labels.leased)} leased`,
-      `${whole(labels.failed)} failed, ${whole(labels.dropped)} dropped${labels.superseded > 0 ? `, ${whole(labels.superseded)} superseded` : ""}${
-        labels.excluded > 0 ? `, ${whole(labels.excluded)} excluded` : ""}`,
+    tile("Labels", `${whole(labels.labelled)} made`, ["queued", "leased", "failed", "dropped", "superseded", "excluded"].filter((name) => labels[name] > 0)
+      .map((name) => `${whole(labels[name])} ${name}`).join(", "),
       labels.lower_states > 0 && `lower states known of ${whole(labels.lower_states)} structures (calmwalk lower-states)`,
-      `${whole(status.labels_last_hour)} made in the last hour`),
+      status.labels_last_hour > 0 && `${whole(status.labels_last_hour)} made in the last hour`),
     (inForce || status.refit) && tile("Potential", `version ${whole(inForce?.number ?? 0)}`,
       inForce?.number > 0 && `trained on ${whole(inForce.labels)} labels`,
       status.refit && `training version ${whole(status.refit.number)}: ${status.refit.remark || words(status.refit.state)}`),
@@ -110,6 +110,10 @@ function exceeded({ level_of_share: share, level_of_growth: growth }) {
   return [share > 1 && "calm.forgetting_alarm", growth > 1 && "calm.max_mean_square_growth"].filter(Boolean).join(" and ") || "the limit";
 }
 
+function hasEarlyEnds(ends) {
+  return ends.some((end) => end.cause != null);
+}
+
 /** Number of ended walks, with early ends. */
 function ended(ends, number) {
   const early = ends.filter((end) => end.cause != null).reduce((sum, end) => sum + end.walks, 0);
@@ -134,8 +138,8 @@ function queue(status) {
   const list = facts([
     ["labels per hour", status.labels_per_hour == null ? null : digits(status.labels_per_hour, "/h")],
     ["oldest lease", oldest && `job ${oldest.job}, for ${duration(Date.now() - oldest.started)}, by ${oldest.holder}`],
-    ["cost so far", digits(cost.core_hours, "core-hours")],
-    ["cost of the queue", remaining && `${digits(remaining.expected)} (${digits(remaining.low)} to ${digits(remaining.high)}) core-hours`],
+    ["cost so far", coreTime(cost.core_hours)],
+    ["cost of the queue", remaining && `${coreTime(remaining.expected)} (${coreTime(remaining.low)} to ${coreTime(remaining.high)})`],
   ]);
   if (failures.length === 0) return list;
   const columns = [["class of failure"], ["failed", true], ["labelled later", true], ["unfinished", true]];
