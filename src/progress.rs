@@ -13,6 +13,7 @@ use tokio_util::sync::CancellationToken;
 use wire::{Origin, WalkId};
 
 use crate::forgetting::{AlarmState, ForgettingMeasurement, ForgettingRule};
+use crate::label_line::LabelLine;
 use crate::output::{count, decimals, print_stderr};
 use crate::wording::walk_ends;
 
@@ -22,6 +23,7 @@ const LINE_INTERVAL: Duration = Duration::from_secs(10);
 /// Display of a run.
 pub struct RunDisplay {
     bars: Option<Bars>,
+    labels: LabelLine,
     names: BTreeMap<WalkId, String>,
     steps: WalkSteps,
     /// Steps of a whole walk.
@@ -48,18 +50,20 @@ struct WalkSteps {
 struct Bars {
     steps: ProgressBar,
     message: ProgressBar,
+    labels: ProgressBar,
     all: MultiProgress,
 }
 
 impl RunDisplay {
     /// Displays walks of `walk_steps` steps each. `walks` are (walk, seed structure, current step), `ends` those of
-    /// earlier runs.
+    /// earlier runs. `labels` shows labels under way below the bars.
     pub fn new(
         walk_steps: u64,
         walks: Vec<(WalkId, String, u64)>,
         ends: WalkEnds,
         forgetting: ForgettingRule,
         stop: CancellationToken,
+        labels: LabelLine,
     ) -> Self {
         let (mut names, mut steps) = (BTreeMap::new(), WalkSteps::default());
         for (walk, name, step) in walks {
@@ -67,8 +71,10 @@ impl RunDisplay {
             steps.set(walk, step);
         }
         let bars = std::io::stderr().is_terminal().then(Bars::new);
+        labels.set_bar(bars.as_ref().map(|bars| bars.labels.clone()));
         let mut display = Self {
             bars,
+            labels,
             names,
             steps,
             walk_steps,
@@ -100,7 +106,9 @@ impl RunDisplay {
 
     /// Removes the bars.
     pub fn finish(self) {
+        self.labels.set_bar(None);
         if let Some(bars) = self.bars {
+            bars.labels.finish_and_clear();
             bars.steps.finish_and_clear();
             bars.message.finish_and_clear();
         }
@@ -233,7 +241,9 @@ impl Bars {
         steps.set_style(style("walks  {bar:32} {pos}/{len} steps  {eta} left  {msg}"));
         let message = all.add(ProgressBar::new_spinner());
         message.set_style(style("{wide_msg}"));
-        Self { steps, message, all }
+        let labels = all.add(ProgressBar::new_spinner());
+        labels.set_style(style("{wide_msg}"));
+        Self { steps, message, labels, all }
     }
 }
 

@@ -11,10 +11,9 @@ use monitor::walk_ends::WalkEnds;
 use store::{CampaignStatus, Store, StoreError, Unlabelled};
 use wire::ContentHash;
 
-use crate::cli::status::declined_because;
 use crate::output::{TextTable, count, decimals};
 use crate::wording::comparison::{estimate, intervals};
-use crate::wording::{budget, end_reason, energies, unlabelled, versions, walk_ends};
+use crate::wording::{budget, candidates, end_reason, energies, unlabelled, versions, walk_ends};
 
 /// Largest number of seed structures with failed labels to show.
 const MAX_SHOWN: usize = 8;
@@ -81,10 +80,10 @@ impl Summary {
     }
 
     fn write_candidates(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let candidates = &self.status.candidates;
-        let declined = declined_because(&candidates.declined, false);
-        writeln!(f, "candidates       {} seen, {} accepted{declined}", candidates.seen, candidates.accepted)?;
-        match candidates.rejected_by_guards {
+        let found = &self.status.candidates;
+        let declined = candidates::declined(&found.declined, false);
+        writeln!(f, "candidates       {} seen, {} accepted{declined}", found.seen, found.accepted)?;
+        match found.rejected_by_guards {
             0 => Ok(()),
             rejected => writeln!(f, "                 {rejected} rejected by guards"),
         }

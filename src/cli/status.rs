@@ -18,7 +18,7 @@ use monitor::expected_end::ExpectedEnd;
 use monitor::label_cost::SECONDS_PER_HOUR;
 use monitor::reference_check::ReferenceCheck;
 use monitor::walk_ends::WalkEnds;
-use store::{CampaignStatus, Candidates, Declined, Location, Store, unix_milliseconds};
+use store::{CampaignStatus, Candidates, Location, Store, unix_milliseconds};
 use wire::DeviceStatistics;
 
 use self::batch_jobs::BatchJobs;
@@ -27,6 +27,7 @@ use self::page::{StatusLayout, cut};
 pub use self::processes::state;
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{count, decimals, print, print_json};
+use crate::wording::candidates;
 use crate::wording::cost::wall_time;
 use crate::wording::disk::megabytes;
 use crate::wording::{self, budget, reference_check, walk_ends};
@@ -217,7 +218,7 @@ fn write_candidates(
 ) -> io::Result<()> {
     let Candidates { seen, accepted, declined, control, rejected_by_guards } = candidates;
     let is_shown = |number: u64| number > 0 || page.is_unlimited();
-    let declined = declined_because(declined, page.is_unlimited());
+    let declined = candidates::declined(declined, page.is_unlimited());
     page.titled(out, "candidates", &format!("{seen} seen, {accepted} accepted{declined}"))?;
     let shared = match shared {
         None | Some(0) => String::new(),
@@ -238,21 +239,4 @@ fn write_candidates(
         parts.push(format!("{left_out} left out (the decision log has the reasons)"));
     }
     if parts.is_empty() { Ok(()) } else { page.titled(out, "", &parts.join("; ")) }
-}
-
-/// The number of declined candidates with their reasons, after a comma; empty without any. `all`: also what did not happen.
-pub fn declined_because(declined: &Declined, all: bool) -> String {
-    let reasons = [
-        ("covered", declined.covered),
-        ("duplicate", declined.duplicate),
-        ("too close", declined.too_close),
-        ("budget", declined.budget),
-        ("backlog", declined.backlog),
-        ("unlikely to complete", declined.unlikely_to_complete),
-        ("grade too large", declined.grade_too_large),
-    ];
-    let sum: u64 = reasons.iter().map(|(_, number)| number).sum();
-    let shown = reasons.iter().filter(|(_, number)| all || *number > 0);
-    let shown: Vec<_> = shown.map(|(reason, number)| format!("{number} {reason}")).collect();
-    if shown.is_empty() { String::new() } else { format!(", {sum} declined ({})", shown.join(", ")) }
 }

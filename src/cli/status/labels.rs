@@ -4,13 +4,13 @@ use std::io::{self, Write};
 
 use monitor::label_cost::{QueueCost, SECONDS_PER_HOUR};
 use monitor::label_queue::{LabelQueue, ProtocolJobs, labels_per_hour};
-use store::{CampaignStatus, FailureCount, LabelJobCounts};
+use store::{CampaignStatus, FailureCount, LabelJobCounts, unix_milliseconds};
 
 use super::page::{StatusLayout, cut};
 use super::processes::since;
 use crate::output::count;
 use crate::wording::cost::{core_hours, core_time, two_digits, wall_time};
-use crate::wording::unlabelled;
+use crate::wording::{label_progress, unlabelled};
 
 /// Writes the state of the queue, costs, failures and the structures without labels.
 pub fn write(
@@ -20,6 +20,10 @@ pub fn write(
     status: &CampaignStatus,
 ) -> io::Result<()> {
     page.titled(out, "labels", &describe_queue(status, page.is_unlimited()))?;
+    let now = unix_milliseconds();
+    for progress in queue.running.iter().take(page.few) {
+        page.titled(out, "", &label_progress::describe(progress, now))?;
+    }
     if let Some(relabelling) = describe_relabelling(&status.labels) {
         page.titled(out, "", &relabelling)?;
     }

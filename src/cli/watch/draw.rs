@@ -321,12 +321,14 @@ fn key_hints(state: &WatchState) -> String {
         },
         (InputMode::Confirm(..), _) => String::new(),
         (InputMode::Panes, WALKS) => {
-            "Tab pane  / filter  Enter decisions  p pause  r resume  i all  ? keys  q quit".into()
+            "Tab pane  / filter  Enter decisions  p pause  r resume  h history  ? keys  q quit".into()
         }
         (InputMode::Panes, QUEUE) => {
             "Tab pane  ↑↓  / filter  Enter open  = priority  d drop  t retry  s view  ? keys".into()
         }
-        (InputMode::Panes, _) => "Tab pane  ↑↓  / filter  Enter open  i all  ? keys  q quit".into(),
+        (InputMode::Panes, _) => {
+            "Tab pane  ↑↓  / filter  Enter open  h history  i all  ? keys  q quit".into()
+        }
     }
 }
 

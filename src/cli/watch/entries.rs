@@ -1,7 +1,8 @@
 //! Walks, label jobs and decisions as entries of the panes, and their quantities for filters.
 
 use atoms::Species;
-use store::{DecidedCandidate, JobState, QueueEntry, RecentDecision, WalkStatus};
+use monitor::label_progress::LabelProgress;
+use store::{DecidedCandidate, JobState, QueueEntry, RecentDecision, WalkStatus, unix_milliseconds};
 use wire::WalkConditions;
 use wire::conditions::VariedConditions;
 
@@ -10,6 +11,7 @@ use crate::cli::status::page::{cut, cut_middle};
 use crate::cli::status::walks;
 use crate::filter::{self, StructureFilter, StructureProperties};
 use crate::output::decimals;
+use crate::wording::label_progress;
 
 /// Columns of the queue: `>` marks numbers, trailing blanks reserve width.
 pub const JOBS: [&str; 8] =
@@ -71,12 +73,14 @@ pub fn walk_entries(
     walks.iter().filter(matches).map(entry).collect()
 }
 
-/// The entries of label jobs that match the filter.
+/// The entries of label jobs that match the filter. `running`: labels under way, which show their time in place of their state.
 pub fn job_entries(
     jobs: &[QueueEntry],
     walks: &[WalkStatus],
+    running: &[LabelProgress],
     filter: Option<&StructureFilter>,
 ) -> Vec<PaneEntry> {
+    let now = unix_milliseconds();
     let matches = |job: &&QueueEntry| {
         let species = filter::species(&job.formula);
         filter.is_none_or(|filter| filter.matches(&facts_of_job(job, &species, walks)))
@@ -91,7 +95,7 @@ pub fn job_entries(
         key: job.job.to_string(),
         columns: vec![
             short_candidate(&job.candidate),
-            job.state.to_string(),
+            state_of_job(job, running, now),
             job.priority.to_string(),
             job.atoms.to_string(),
             cut(&job.formula, 9),
@@ -160,6 +164,12 @@ fn decision_entry(decision: &RecentDecision, width: usize) -> PaneEntry {
 /// The id of a candidate without the campaign part, which is the same for all.
 pub fn without_campaign(candidate: &str) -> &str {
     candidate.split_once('-').map_or(candidate, |(_, rest)| rest)
+}
+
+fn state_of_job(job: &QueueEntry, running: &[LabelProgress], now: i64) -> String {
+    let progress =
+        running.iter().find(|progress| progress.label.job == job.job && job.state == JobState::Leased);
+    progress.map_or_else(|| job.state.to_string(), |progress| label_progress::short(progress, now))
 }
 
 /// Walk, segment and step of a candidate, with eight digits of its hash.

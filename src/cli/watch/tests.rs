@@ -262,9 +262,9 @@ fn a_history_is_shown_if_its_text_view_is_still_open() {
     let id = job(2, JobState::Queued).candidate;
     assert_eq!(press(&mut state, "2 Down Enter"), Some(WatchRequest::Explain(id.clone())));
     assert!(screen(&mut state, 80, 24).contains("reading …"));
-    state.complete(Completed::Explain("another".into(), Ok("wrong".into())));
+    state.complete(Completed::Text("another".into(), Ok("wrong".into())));
     let lines: Vec<_> = (1..=50).map(|k| format!("line {k}.")).collect();
-    state.complete(Completed::Explain(id.clone(), Ok(lines.join("\n"))));
+    state.complete(Completed::Text(id.clone(), Ok(lines.join("\n"))));
     let text = screen(&mut state, 80, 24);
     assert!(text.contains("line 1.") && text.contains(&id) && text.contains("lines 1 to 21 of 50"), "{text}");
     press(&mut state, "End");
@@ -273,7 +273,7 @@ fn a_history_is_shown_if_its_text_view_is_still_open() {
     press(&mut state, "k");
     assert!(screen(&mut state, 80, 24).contains("line 29."), "one line up from the end");
     press(&mut state, "q");
-    state.complete(Completed::Explain(id, Ok("late".into())));
+    state.complete(Completed::Text(id, Ok("late".into())));
     assert!(matches!(state.mode, InputMode::Panes));
     assert_eq!(press(&mut state, "q"), Some(WatchRequest::Quit(ExitStatus::Done)));
 }

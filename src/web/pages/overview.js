@@ -3,12 +3,16 @@
 import { canPause, pauseButton } from "./actions.js";
 import { listen } from "./api.js";
 import { element, facts, renew, section, sentence, state, table, words } from "./dom.js";
-import { bytes, coreTime, counted, decimals, digits, duration, percent, time, whole } from "./format.js";
+import { bytes, coreTime, counted, decimals, digits, duration, percent, shortName, time, whole } from "./format.js";
+import { overHistory } from "./history.js";
 import { overTime } from "./plots.js";
 import { campaignState } from "./campaign_state.js";
 import { versions } from "./versions.js";
 
 export const TITLE = "Overview";
+
+/** Largest number of labels under way shown. */
+const LABELS = 10;
 
 /** Largest number of walks shown; running ones come first. */
 const WALKS = 40;
@@ -21,9 +25,11 @@ const WALK_COLUMNS = [["walk", true], ["seed structure"], ["origin"], ["state"],
 
 export function show(content, _, signal) {
   const tiles = element("div", { class: "tiles" });
+  const history = element("div", { class: "plots" });
   const plots = element("div", { class: "plots" });
   const rest = element("div");
-  content.append(tiles, section("Since the dashboard started", plots), rest);
+  content.append(tiles, section("History", history, plots), rest);
+  overHistory(history, signal);
   overTime(plots, signal);
   let [status, changes] = [null, false];
   const draw = () => {
@@ -141,10 +147,24 @@ function queue(status) {
     ["cost so far", coreTime(cost.core_hours)],
     ["cost of the queue", remaining && `${coreTime(remaining.expected)} (${coreTime(remaining.low)} to ${coreTime(remaining.high)})`],
   ]);
-  if (failures.length === 0) return list;
+  const making = inProgress(status.labels_in_progress);
+  if (failures.length === 0) return element("div", {}, list, making);
   const columns = [["class of failure"], ["failed", true], ["labelled later", true], ["unfinished", true]];
   const rows = failures.map((failure) => [words(failure.class), whole(failure.failed), whole(failure.labelled), whole(failure.unfinished)]);
-  return element("div", {}, list, table("Label failures by class", columns, rows));
+  return element("div", {}, list, making, table("Label failures by class", columns, rows));
+}
+
+/** Labels that are being made, the longest first. */
+function inProgress(labels) {
+  if (labels.length === 0) return "";
+  const columns = [["candidate"], ["formula"], ["protocol"], ["attempt", true], ["time so far", true], ["expected end", true], ["labeller"]];
+  return table("Labels under way", columns, labels.slice(0, LABELS).map((one) => {
+    const name = one.candidate.startsWith("import-") ? one.candidate
+      : element("a", { href: `#candidate/${encodeURIComponent(one.candidate)}`, title: one.candidate }, shortName(one.candidate));
+    const left = one.expected_seconds == null ? null : one.started + 1000 * one.expected_seconds - Date.now();
+    const end = left == null ? "unknown" : left > 0 ? `in ${duration(left)}` : "overdue";
+    return [name, one.formula, one.protocol, whole(one.attempt), duration(Date.now() - one.started), end, one.holder];
+  }));
 }
 
 function budget(status) {
