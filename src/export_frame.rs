@@ -38,7 +38,13 @@ pub fn facts<'a>(
         ..StructureProperties::default()
     };
     let ExportSource::Candidate {
-        block, original, origin, seed_structure_name, mixture_version_after, ..
+        block,
+        selector_gamma,
+        original,
+        origin,
+        seed_structure_name,
+        mixture_version_after,
+        ..
     } = &row.source
     else {
         return of_label;
@@ -46,6 +52,7 @@ pub fn facts<'a>(
     let view = block.view();
     StructureProperties {
         gamma: largest(&original.gamma),
+        gamma_current: *selector_gamma,
         gamma_nbr: largest(&original.gamma_nbr),
         relative_volume: Some(view.relative_volume()),
         kinetic_temperature: Some(view.temperature()),
@@ -113,6 +120,7 @@ fn add_source(frame: &mut Frame, source: ExportSource, conditions: &BTreeMap<Wal
             origin,
             mixture_version_after,
             block,
+            selector_gamma,
             original,
             ..
         } => {
@@ -137,6 +145,12 @@ fn add_source(frame: &mut Frame, source: ExportSource, conditions: &BTreeMap<Wal
             info("mixture_version", integer(mixture_version_after));
             info("mixture_version_seen", integer(view.mixture_version()));
             info("relative_volume", view.relative_volume().into());
+            let largest = original.gamma.iter().copied().reduce(f64::max);
+            for (key, gamma) in [("gamma_max", selector_gamma), ("gamma_max_original", largest)] {
+                if let Some(gamma) = gamma {
+                    info(key, gamma.into());
+                }
+            }
             frame.arrays.insert("gamma".to_owned(), scalars(original.gamma));
             frame.arrays.insert("gamma_nbr".to_owned(), scalars(original.gamma_nbr));
         }
@@ -194,6 +208,7 @@ mod tests {
             origin: Origin::Biased,
             mixture_version_after: 1,
             block,
+            selector_gamma: Some(1.5),
             original: Default::default(),
         }
     }

@@ -24,6 +24,7 @@ mod filter;
 mod forgetting;
 mod grace_projection;
 mod initial_mixture;
+mod label_line;
 mod label_method;
 mod label_setup;
 mod labelled_frames;

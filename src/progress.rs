@@ -13,7 +13,8 @@ use tokio_util::sync::CancellationToken;
 use wire::{Origin, WalkId};
 
 use crate::forgetting::{AlarmState, ForgettingMeasurement, ForgettingRule};
-use crate::output::{count, print_stderr};
+use crate::label_line::LabelLine;
+use crate::output::{count, decimals, print_stderr};
 use crate::wording::walk_ends;
 
 /// Interval between plain lines that only report steps.
@@ -22,6 +23,7 @@ const LINE_INTERVAL: Duration = Duration::from_secs(10);
 /// Display of a run.
 pub struct RunDisplay {
     bars: Option<Bars>,
+    labels: LabelLine,
     names: BTreeMap<WalkId, String>,
     steps: WalkSteps,
     /// Steps of a whole walk.
@@ -48,18 +50,20 @@ struct WalkSteps {
 struct Bars {
     steps: ProgressBar,
     message: ProgressBar,
+    labels: ProgressBar,
     all: MultiProgress,
 }
 
 impl RunDisplay {
     /// Displays walks of `walk_steps` steps each. `walks` are (walk, seed structure, current step), `ends` those of
-    /// earlier runs.
+    /// earlier runs. `labels` shows labels under way below the bars.
     pub fn new(
         walk_steps: u64,
         walks: Vec<(WalkId, String, u64)>,
         ends: WalkEnds,
         forgetting: ForgettingRule,
         stop: CancellationToken,
+        labels: LabelLine,
     ) -> Self {
         let (mut names, mut steps) = (BTreeMap::new(), WalkSteps::default());
         for (walk, name, step) in walks {
@@ -67,8 +71,10 @@ impl RunDisplay {
             steps.set(walk, step);
         }
         let bars = std::io::stderr().is_terminal().then(Bars::new);
+        labels.set_bar(bars.as_ref().map(|bars| bars.labels.clone()));
         let mut display = Self {
             bars,
+            labels,
             names,
             steps,
             walk_steps,
@@ -100,7 +106,9 @@ impl RunDisplay {
 
     /// Removes the bars.
     pub fn finish(self) {
+        self.labels.set_bar(None);
         if let Some(bars) = self.bars {
+            bars.labels.finish_and_clear();
             bars.steps.finish_and_clear();
             bars.message.finish_and_clear();
         }
@@ -116,14 +124,22 @@ impl RunDisplay {
         }
         for candidate in &commit.candidates {
             let view = candidate.block.view();
-            let (id, gamma_max) = (view.id(), calm::grade::maximum(view.gamma));
+            let id = view.id();
+            let largest = |grades: &store::records::AtomGrades| {
+                decimals(grades.gamma.iter().copied().reduce(f64::max), 2)
+            };
+            let [current, original] = [&candidate.selector, &candidate.original].map(largest);
             let what = match candidate.fate {
                 Fate::Accepted if view.origin() == Origin::Control => "control frame".to_owned(),
                 Fate::Accepted => "accepted".to_owned(),
                 Fate::Declined(reason) => format!("declined ({})", reason.name().replace('_', " ")),
             };
             self.accepted += u64::from(candidate.fate == Fate::Accepted && view.origin() == Origin::Biased);
-            self.show(&format!("{}: step {}, γ_max {gamma_max:.2}, {what}", self.name(id.walk), id.step));
+            self.show(&format!(
+                "{}: step {}, γ_max {current}, γ₀_max {original}, {what}",
+                self.name(id.walk),
+                id.step
+            ));
         }
         for decision in commit.decisions.iter().filter(|decision| decision.kind == "left_out") {
             let (step, error) =
@@ -225,7 +241,9 @@ impl Bars {
         steps.set_style(style("walks  {bar:32} {pos}/{len} steps  {eta} left  {msg}"));
         let message = all.add(ProgressBar::new_spinner());
         message.set_style(style("{wide_msg}"));
-        Self { steps, message, all }
+        let labels = all.add(ProgressBar::new_spinner());
+        labels.set_style(style("{wide_msg}"));
+        Self { steps, message, labels, all }
     }
 }
 

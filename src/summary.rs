@@ -13,7 +13,7 @@ use wire::ContentHash;
 
 use crate::output::{TextTable, count, decimals};
 use crate::wording::comparison::{estimate, intervals};
-use crate::wording::{budget, end_reason, energies, unlabelled, versions, walk_ends};
+use crate::wording::{budget, candidates, end_reason, energies, unlabelled, versions, walk_ends};
 
 /// Largest number of seed structures with failed labels to show.
 const MAX_SHOWN: usize = 8;
@@ -80,32 +80,13 @@ impl Summary {
     }
 
     fn write_candidates(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let candidates = &self.status.candidates;
-        let declined = &candidates.declined;
-        let seldom = [
-            ("unlikely to complete", declined.unlikely_to_complete),
-            ("grade too large", declined.grade_too_large),
-        ];
-        let all = declined.covered
-            + declined.duplicate
-            + declined.too_close
-            + declined.budget
-            + declined.backlog
-            + seldom.iter().map(|(_, count)| count).sum::<u64>();
-        let there = seldom.iter().filter(|(_, count)| *count > 0);
-        let seldom: String = there.map(|(reason, count)| format!(", {reason} {count}")).collect();
-        writeln!(
-            f,
-            "candidates       {} seen, {} accepted, {all} declined (covered {}, duplicate {}, too close {}, budget {}, backlog {}{seldom})",
-            candidates.seen,
-            candidates.accepted,
-            declined.covered,
-            declined.duplicate,
-            declined.too_close,
-            declined.budget,
-            declined.backlog
-        )?;
-        writeln!(f, "                 {} rejected by guards", candidates.rejected_by_guards)
+        let found = &self.status.candidates;
+        let declined = candidates::declined(&found.declined, false);
+        writeln!(f, "candidates       {} seen, {} accepted{declined}", found.seen, found.accepted)?;
+        match found.rejected_by_guards {
+            0 => Ok(()),
+            rejected => writeln!(f, "                 {rejected} rejected by guards"),
+        }
     }
 
     fn write_labels(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -118,15 +99,16 @@ impl Summary {
             0 => String::new(),
             labels => format!(", {labels} excluded by hand"),
         };
+        let part =
+            |number: u64, what: &str| if number > 0 { format!(", {number} {what}") } else { String::new() };
+        let (failed, dropped) = (part(labels.failed, "failed"), part(labels.dropped, "dropped"));
         writeln!(
             f,
-            "labels           {}{} biased and {} control structures labelled{}, {} failed, {} dropped{superseded}{excluded}",
+            "labels           {}{} biased and {} control structures labelled{}{failed}{dropped}{superseded}{excluded}",
             versions_note(statistics),
             statistics.biased.structures + statistics.shared,
             statistics.control.structures + statistics.shared,
             shared_note(statistics),
-            labels.failed,
-            labels.dropped
         )?;
         write!(f, "{}", unlabelled::describe(&self.unlabelled, 17, MAX_SHOWN))
     }

@@ -75,9 +75,11 @@ fn score_golden(model: &str, artifact: bool) {
         arguments.extend(["--artifact", gmm.to_str().unwrap()]);
     }
     let printed = succeed(here, arguments);
-    assert_eq!(printed, format!("wrote {} structures with grades to out.extxyz\n", frames.len()));
+    let (first, listed) = printed.split_once('\n').unwrap();
+    assert_eq!(first, format!("wrote {} structures with grades to out.extxyz", frames.len()));
 
     let scored = read_extxyz(&here.join("out.extxyz")).unwrap();
+    check_list(listed, &scored);
     assert_eq!(scored.len(), frames.len());
     for (k, (frame, input)) in scored.iter().zip(&frames).enumerate() {
         assert_eq!(frame.structure, input.structure);
@@ -241,7 +243,8 @@ fn structures_that_cannot_be_graded_are_left_out() {
     assert_eq!(output.status.code(), Some(0), "{said}");
     let line = "left out 2 structures that cannot be graded; the first: in.extxyz:4: atom 0 is Si";
     assert!(said.contains(line), "{said}");
-    assert_eq!(String::from_utf8(output.stdout).unwrap(), "wrote 2 structures with grades to out.extxyz\n");
+    let printed = String::from_utf8(output.stdout).unwrap();
+    assert!(printed.starts_with("wrote 2 structures with grades to out.extxyz\n"), "{printed}");
     assert_eq!(read_extxyz(&here.join("out.extxyz")).unwrap().len(), 2);
     let features = NpyFile::new(BufReader::new(File::open(here.join("z.npy")).unwrap())).unwrap();
     assert_eq!(features.shape(), [2, 130]);
@@ -330,4 +333,20 @@ fn files_that_do_not_belong_together_are_refused() {
     assert!(refuse(here, ["calm", "info", &path("data/Si.sw")]).contains("expected a NumPy .npz archive"));
     assert!(refuse(here, ["calm", "info", &path("data/al_eam_1l/golden.npz")]).contains("neither"));
     assert_eq!(calmwalk(here, ["calm", "score"]).status.code(), Some(2));
+}
+
+/// Checks what is printed of each structure against its grades.
+fn check_list(listed: &str, scored: &[Frame]) {
+    for frame in scored {
+        let atoms::extxyz::ColumnData::Real(gamma) = &frame.arrays["gamma"].entries else {
+            panic!("no numbers")
+        };
+        let worst = (0..gamma.len()).max_by(|a, b| gamma[*a].total_cmp(&gamma[*b])).unwrap();
+        let above = gamma.iter().filter(|gamma| **gamma > 1.0).count();
+        let expected = [format!("{:.2}", gamma[worst]), above.to_string(), worst.to_string()];
+        let has = |line: &str| {
+            line.split_whitespace().collect::<Vec<_>>().windows(3).any(|cells| cells == expected)
+        };
+        assert!(scored.len() > 20 || listed.lines().any(has), "{expected:?}\n{listed}");
+    }
 }

@@ -221,7 +221,7 @@ fn walks_without_a_record_are_refused() {
     }
     succeed(here, ["rerun", "here", "1"]);
     // The tables of version 19.
-    let sql = "DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
+    let sql = "DROP TABLE sample; DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
         UPDATE walk SET selector_state = replace(selector_state, '\"records\"', '\"before\"'), checksum = -1;
         DELETE FROM _sqlx_migrations WHERE version > 19; PRAGMA user_version = 19;";
     execute(here, sql);

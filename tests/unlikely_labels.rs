@@ -92,7 +92,7 @@ fn walks_avoid_what_cannot_be_labelled() {
     let summary = succeed(here, ["run", "campaign.toml"]);
     let status: Json = serde_json::from_str(&succeed(here, ["status", "campaign", "--json"])).unwrap();
     let declined = status["candidates"]["declined"]["unlikely_to_complete"].as_u64().unwrap();
-    assert!(declined > 10 && summary.contains(&format!("unlikely to complete {declined}")), "{summary}");
+    assert!(declined > 10 && summary.contains(&format!("{declined} unlikely to complete")), "{summary}");
     succeed(here, ["report", "campaign", "-o", "report"]);
     let collection = fs::read_to_string(here.join("report/figures/collection.csv")).unwrap();
     assert!(collection.contains(&format!("a,unlikely to complete,{declined},")), "{collection}");

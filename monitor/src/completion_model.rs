@@ -267,7 +267,7 @@ fn rows(diagram: &ReliabilityDiagram) -> Vec<CompletionReliability> {
 
 /// The weights with the names of their predictors.
 fn named(coefficients: &CompletionCoefficients) -> Vec<(String, f64)> {
-    let fixed = ["intercept", "ln γ_max", "V/V₀", "(V/V₀)²", "shortest bond"].map(str::to_owned);
+    let fixed = ["intercept", "ln γ₀_max", "V/V₀", "(V/V₀)²", "shortest bond"].map(str::to_owned);
     let elements = coefficients.elements.iter().skip(1);
     let names = fixed.into_iter().chain(elements.map(|number| atoms::element_symbol(*number).to_owned()));
     let values = [coefficients.intercept].into_iter().chain(coefficients.weights.iter().copied());

@@ -86,6 +86,12 @@ impl CostEstimator {
         self.predict([(self.size_of(waiting), 1)])
     }
 
+    /// Expected core-seconds of a successful attempt at a job.
+    pub fn predict_attempt(&self, waiting: &PendingJobs) -> Option<f64> {
+        let predicted = self.model.as_ref()?.predict_all([(self.size_of(waiting), 1)])?;
+        Some(predicted.core_seconds)
+    }
+
     /// A job has the size of the newest label of its seed structure and formula. Otherwise only the number of atoms
     /// is known.
     fn size_of(&self, waiting: &PendingJobs) -> CostPredictors {
@@ -102,9 +108,12 @@ impl CostEstimator {
 }
 
 /// Cost of the jobs that have no label of `protocol` yet.
-pub async fn queue_cost(store: &Store, protocol: ContentHash) -> Result<QueueCost, StoreError> {
-    let waiting = store.waiting_jobs(protocol).await?;
-    let (costs, work) = (CostEstimator::from_store(store, protocol).await?, store.label_usage().await?);
+pub async fn queue_cost(
+    store: &Store,
+    protocol: ContentHash,
+    costs: &CostEstimator,
+) -> Result<QueueCost, StoreError> {
+    let (waiting, work) = (store.waiting_jobs(protocol).await?, store.label_usage().await?);
     let remaining = costs.predict(waiting.iter().map(|waiting| (costs.size_of(waiting), waiting.jobs)));
     let hours_left = remaining.filter(|_| work.cores > 0).map(|hours| hours.expected / work.cores as f64);
     Ok(QueueCost {

@@ -3,7 +3,8 @@
 use serde_json::{Value, json};
 use store::{CampaignStatus, FailureCount, JobState, Store, StoreError, Unlabelled};
 
-use crate::label_cost::{self, QueueCost};
+use crate::label_cost::{self, CostEstimator, QueueCost};
+use crate::label_progress::{self, LabelProgress};
 use crate::versions::newest_with_labels;
 
 /// Largest number of labelled structures for which ranges of grades and volumes are computed.
@@ -20,6 +21,8 @@ pub struct LabelQueue {
     pub unlabelled: Vec<Unlabelled>,
     /// The label jobs of each protocol.
     pub by_protocol: Vec<ProtocolJobs>,
+    /// Labels that are being made, the longest first; at most [`label_progress::MAX_RUNNING`].
+    pub running: Vec<LabelProgress>,
     /// Structures found by both biased and control walks, with one label each; not counted in large campaigns.
     pub shared: Option<u64>,
 }
@@ -52,8 +55,10 @@ impl LabelQueue {
                 store.unlabelled(protocol.hash, version, labelled <= MAX_STRUCTURES).await?
             }
         };
+        let costs = CostEstimator::from_store(store, protocol.hash).await?;
         Ok(Self {
-            cost: label_cost::queue_cost(store, protocol.hash).await?,
+            cost: label_cost::queue_cost(store, protocol.hash, &costs).await?,
+            running: label_progress::read(store, &costs).await?,
             failures: store.failures(protocol.hash).await?,
             unlabelled,
             by_protocol: by_protocol(&store.jobs_by_protocol().await?, &protocol.name),
@@ -65,6 +70,7 @@ impl LabelQueue {
     pub(crate) fn add_to(&self, json: &mut Value, status: &CampaignStatus) {
         json["labels_per_hour"] = json!(labels_per_hour(status));
         json["cost"] = json!({ "core_hours": status.budget.used.core_hours, "queue": self.cost });
+        json["labels_in_progress"] = json!(self.running);
         json["failures"] = json!(self.failures);
         json["unlabelled"] = json!(self.unlabelled);
         json["shared_structures"] = json!(self.shared);

@@ -17,7 +17,7 @@ DATABASE = "campaign.sqlite"
 # `PRAGMA application_id` of a campaign: "CALM".
 APPLICATION = 0x43414C4D
 # Versions of the tables that this package reads. Those before have other words and columns, those after are not known.
-OLDEST_SCHEMA, NEWEST_SCHEMA = 16, 21
+OLDEST_SCHEMA, NEWEST_SCHEMA = 16, 22
 # Time for which SQLite waits for a lock, s.
 _BUSY_TIMEOUT = 10.0
 # The tables have the keyword STRICT.

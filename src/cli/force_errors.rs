@@ -144,7 +144,7 @@ fn write(out: &mut dyn Write, protocol: &Protocol, statistics: &LabelStatistics)
     for (name, errors) in [("γ", &all.gamma), ("γ_nbr", &all.gamma_nbr)] {
         write_bins(out, name, &errors.bins())?;
     }
-    write_completion(out, "γ_max", &statistics.by_gamma.bins())?;
+    write_completion(out, "γ₀_max", &statistics.by_gamma.bins())?;
     write_completion(out, "V/V₀", &statistics.by_expansion.bins())
 }
 

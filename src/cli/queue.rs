@@ -6,11 +6,13 @@ mod files;
 use std::io::{self, Write};
 use std::path::PathBuf;
 
+use monitor::label_cost::SECONDS_PER_HOUR;
 use store::{Attempt, JobDetails, JobState, Location, QueueEntry, Store, WalkVersions, unix_milliseconds};
 
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{TextTable, count, decimals, print, print_json};
 use crate::wording;
+use crate::wording::cost::{core_time, wall_time};
 
 /// List, show, drop, retry or prioritise structures in the label queue
 ///
@@ -35,6 +37,9 @@ pub enum QueueCommand {
     Show {
         /// Id of the candidate
         id: String,
+        /// Also show the logs of attempts that made a label
+        #[arg(long)]
+        all: bool,
     },
     /// Write the archived calculation directories of a candidate to files (label.keep_directories selects what is archived)
     Files {
@@ -98,9 +103,13 @@ impl QueueArgs {
                     print(|out| write_list(out, &jobs, &versions, list))?
                 }
             }
-            QueueCommand::Show { id } => {
+            QueueCommand::Show { id, all } => {
                 let details = block_on(read_details(location, id))??;
-                if self.json { print_json(&details)? } else { print(|out| write_details(out, &details))? }
+                if self.json {
+                    print_json(&details)?
+                } else {
+                    print(|out| write_details(out, &details, *all))?
+                }
             }
             QueueCommand::Files { id, output } => {
                 let written = block_on(files::write(location, id, output))??;
@@ -155,7 +164,7 @@ pub async fn change(
     let store = Store::open(location).await?;
     let ids = match action {
         QueueCommand::Drop { ids } | QueueCommand::Retry { ids } => ids.as_slice(),
-        QueueCommand::Show { id } | QueueCommand::Prioritise { id, .. } => std::slice::from_ref(id),
+        QueueCommand::Show { id, .. } | QueueCommand::Prioritise { id, .. } => std::slice::from_ref(id),
         QueueCommand::List(_) | QueueCommand::Files { .. } | QueueCommand::Completion => &[],
     };
     for id in ids {
@@ -209,8 +218,18 @@ fn write_list(
             offset => writeln!(out, "no {state}jobs after the first {offset}"),
         };
     }
-    let mut titles =
-        vec!["id", "state", ">priority", ">atoms", "formula", ">γ_max", ">attempts", ">failed", "protocol"];
+    let mut titles = vec![
+        "id",
+        "state",
+        ">priority",
+        ">atoms",
+        "formula",
+        ">γ_max",
+        ">γ₀_max",
+        ">attempts",
+        ">failed",
+        "protocol",
+    ];
     let have_values = jobs.iter().any(|job| job.value.is_some());
     titles.extend(have_values.then_some(">value"));
     titles.extend((!versions.is_single()).then_some(">version"));
@@ -222,6 +241,7 @@ fn write_list(
             job.priority.to_string(),
             job.atoms.to_string(),
             job.formula.clone(),
+            decimals(job.selector_gamma, 2),
             decimals(job.original_gamma, 2),
             job.attempts.to_string(),
             job.failures.to_string(),
@@ -239,7 +259,7 @@ fn write_list(
     Ok(())
 }
 
-fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
+fn write_details(out: &mut dyn Write, details: &JobDetails, all: bool) -> io::Result<()> {
     let QueueEntry {
         job,
         candidate,
@@ -250,6 +270,7 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
         expires,
         atoms,
         formula,
+        selector_gamma,
         original_gamma,
         relabel,
         value,
@@ -274,7 +295,8 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
         writeln!(out, "  leased by {holder}, lease expires in {left} s")?;
     }
     writeln!(out, "  atoms     {atoms}, {formula}")?;
-    writeln!(out, "  γ_max     {} (original mixture)", decimals(*original_gamma, 3))?;
+    let [current, original] = [*selector_gamma, *original_gamma].map(|gamma| decimals(gamma, 3));
+    writeln!(out, "  γ_max     {current} at the decision; γ₀_max {original} (original mixture)")?;
     for ((status, energy), adjustments) in details.energies.iter().zip(&details.retry_adjustments) {
         let status = format!("{status:?}").to_lowercase();
         let per_atom = energy / f64::from(*atoms);
@@ -287,7 +309,7 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
         "  attempts  {}, {} failed since it was last queued",
         details.job.attempts, details.job.failures
     )?;
-    details.attempts_made.iter().try_for_each(|attempt| write_attempt(out, attempt))
+    details.attempts_made.iter().try_for_each(|attempt| write_attempt(out, attempt, all))
 }
 
 fn write_files(out: &mut dyn Write, written: &[(PathBuf, String)]) -> io::Result<()> {
@@ -301,7 +323,7 @@ fn write_files(out: &mut dyn Write, written: &[(PathBuf, String)]) -> io::Result
     Ok(())
 }
 
-fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
+fn write_attempt(out: &mut dyn Write, attempt: &Attempt, all: bool) -> io::Result<()> {
     let Attempt {
         attempt: number,
         holder,
@@ -316,21 +338,21 @@ fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
     } = attempt;
     let outcome = outcome.as_deref().unwrap_or("running");
     let lasted = ended.map(|ended| (ended - started) as f64 / 1000.0);
-    let lasted = lasted.map_or(String::new(), |seconds| format!(" after {seconds:.1} s"));
+    let lasted = lasted.map_or(String::new(), |seconds| format!(" after {}", wall_time(seconds)));
     let class = class.as_ref().map_or(String::new(), |class| format!(" ({})", class.replace('_', " ")));
     writeln!(out, "    {number}: {outcome}{class}{lasted}, by {holder}")?;
     if let Some(calculation) = calculation {
         writeln!(out, "       calculation {calculation}")?;
     }
     if let (Some(seconds), Some(cores)) = (core_seconds, made.cores) {
-        writeln!(out, "       cost {seconds:.1} core-seconds on {}", count(cores, "core"))?;
+        writeln!(out, "       cost {} on {}", core_time(seconds / SECONDS_PER_HOUR), count(cores, "core"))?;
     }
     if let Some(remedies) = &made.remedies {
         writeln!(out, "       retry adjustments: {}", remedies.replace(',', ", "))?;
     }
     let difference = made.difference.as_deref().unwrap_or_default();
     difference.lines().try_for_each(|line| writeln!(out, "       {line}"))?;
-    let log = log.as_deref().unwrap_or_default();
+    let log = log.as_deref().filter(|_| all || !attempt.made_label()).unwrap_or_default();
     log.lines().try_for_each(|line| writeln!(out, "       | {line}"))
 }
 
@@ -352,6 +374,7 @@ mod tests {
             failures: 0,
             atoms: 54,
             formula: "Mo54".into(),
+            selector_gamma: Some(1.4),
             original_gamma: Some(1.5),
             original_gamma_nbr: None,
             origin: "biased".into(),

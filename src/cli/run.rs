@@ -30,9 +30,11 @@ use crate::campaign::LoadedCampaign;
 use crate::disk_forecast;
 use crate::duration::Duration;
 use crate::forgetting::{ForgettingMeasurement, ForgettingRule};
+use crate::label_line::LabelLine;
 use crate::label_setup::LABEL_METHOD_KEY;
-use crate::output::{log_and_print, log_and_warn, print, warn_if_unencrypted};
+use crate::output::{count, log_and_print, log_and_warn, print, warn_if_unencrypted};
 use crate::refit::schedule::RefitSchedule;
+use crate::runtime::campaign_watch;
 use crate::runtime::notify::{self, Notifier};
 use crate::runtime::reference_check::{self, ANY_CHECK};
 use crate::runtime::{self, time_budget, version_loop};
@@ -203,12 +205,14 @@ async fn run(
     warn_about_idle_walkers(campaign, location);
     let (stop, superseded) = (CancellationToken::new(), CancellationToken::new());
     let walks_end = superseded.child_token();
+    let labels = LabelLine::default();
     let run = runtime::RunContext {
         campaign,
         store: &store,
         process: &process,
         directory,
         listen,
+        labels: &labels,
         stop: &stop,
         superseded: &superseded,
         walks_end: &walks_end,
@@ -257,7 +261,8 @@ async fn print_end(
 ) -> Result<ExitStatus, CommandError> {
     let summary = summary::read(store, campaign.protocol.hash).await?;
     let status = store.status().await?;
-    let (failed, ends) = (status.labels.failed, WalkEnds::from_walks(&status.walks));
+    let (failed, labelled) = (status.labels.failed, status.labels.labelled);
+    let ends = WalkEnds::from_walks(&status.walks);
     let argument = shell_argument(location);
     let file = match location {
         Location::Directory(_) => format!("/{DATABASE}"),
@@ -266,12 +271,24 @@ async fn print_end(
     print(|out| {
         writeln!(out, "{summary}")?;
         writeln!(out, "the campaign is in {argument}{file}; next:")?;
-        writeln!(out, "  calmwalk status {argument}")?;
-        writeln!(out, "  calmwalk queue {argument} list")?;
+        let mut hint = |command: &str, what: &str| writeln!(out, "  {command:<52}  # {what}");
+        hint(&format!("calmwalk report {argument} --output report"), "figures and tables as one page")?;
+        hint(&format!("calmwalk force-errors {argument}"), "where the potential errs")?;
+        hint(&format!("calmwalk dashboard {argument}"), "the structures in a browser")?;
         if failed > 0 {
-            writeln!(out, "  calmwalk queue {argument} list --state failed")?;
+            let what = format!("{failed} without a label, and why");
+            hint(&format!("calmwalk queue {argument} list --state failed"), &what)?;
         }
-        writeln!(out, "  calmwalk export {argument} --output dataset.extxyz")
+        if labelled > 0 {
+            let what = format!("{} ready", count(labelled, "label"));
+            hint(&format!("calmwalk export {argument} --output dataset.extxyz"), &what)?;
+            if campaign.config.refit.is_none() && campaign.config.potential.python.is_none() {
+                let model = campaign.config.potential.model.get_ref().display();
+                let upfit = format!("calmwalk upfit --model '{model}' dataset.extxyz -o improved.npz");
+                hint(&upfit, "train the potential on them")?;
+            }
+        }
+        Ok(())
     })?;
     if ends.all_early() {
         log_and_warn(format_args!("calmwalk: the campaign has failed: {}", walk_ends::warning(&ends)));
@@ -295,7 +312,7 @@ async fn work(
     selector: Selector,
     mode: runtime::RunMode<'_>,
 ) -> Result<reactor::RunOutcome, CommandError> {
-    let runtime::RunContext { campaign, store, stop, .. } = run;
+    let runtime::RunContext { campaign, store, process, labels, stop, .. } = run;
     let Surroundings { location, lock, web } = surroundings;
     let (limits, used_up) = (campaign.config.budget(), time_budget::exhausted_time_limit(store).await?);
     let work = async {
@@ -317,7 +334,10 @@ async fn work(
         error = time_budget::track(store, &limits, stop) => Err(error.into()),
         error = lock::lost(lock) => Err(error.into()),
         never = notify::run(&mut notifier) => match never {},
+        never = campaign_watch::watch(store, process.started, labels) => match never {},
     };
+    // Where the next run, or a view, finds the campaign; other parts of the run report a broken database.
+    let _ = store.add_history_sample(process.started, unix_milliseconds()).await;
     notify::finish(notifier, worked.as_ref().err()).await;
     serving.end().await;
     worked

@@ -22,11 +22,13 @@ use store::{CampaignStatus, Candidates, Location, Store, unix_milliseconds};
 use wire::DeviceStatistics;
 
 use self::batch_jobs::BatchJobs;
+pub use self::labels::describe_queue;
 use self::page::{StatusLayout, cut};
 pub use self::processes::state;
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{count, decimals, print, print_json};
-use crate::wording::cost::two_digits;
+use crate::wording::candidates;
+use crate::wording::cost::wall_time;
 use crate::wording::disk::megabytes;
 use crate::wording::{self, budget, reference_check, walk_ends};
 
@@ -183,24 +185,28 @@ pub fn end(snapshot: &Snapshot) -> Option<String> {
 /// The expected end as text; `None` if it is unknown.
 fn expected_end(end: &ExpectedEnd) -> Option<String> {
     let milliseconds = end.time? - unix_milliseconds();
-    let hours = two_digits(milliseconds.max(0) as f64 / 1000.0 / SECONDS_PER_HOUR);
-    let part = |what: &str, hours: Option<f64>| hours.map(|hours| format!("{what} {} h", two_digits(hours)));
+    let within = wall_time(milliseconds.max(0) as f64 / 1000.0);
+    let part = |what: &str, hours: Option<f64>| {
+        hours.map(|hours| format!("{what} {}", wall_time(hours * SECONDS_PER_HOUR)))
+    };
     let parts =
         [part("walks", end.walks_hours), part("labels", end.labels_hours), part("budget", end.budget_hours)];
     let parts: Vec<_> = parts.into_iter().flatten().collect();
-    Some(format!("expected within {hours} h ({})", parts.join(", ")))
+    Some(format!("expected within {within} ({})", parts.join(", ")))
 }
 
 fn describe_walks(status: &CampaignStatus, ends: &WalkEnds) -> String {
     let under_way = status.walks.iter().filter(|walk| walk.is_active()).count();
     let state = if status.run_active { "running" } else { "unfinished" };
     let ended = match ends.ended() {
-        0 => "0 ended".to_owned(),
+        0 => String::new(),
         ended => format!("{ended} ended ({})", walk_ends::without_causes(ends)),
     };
     let speed = status.steps_per_second.filter(|_| under_way > 0);
     let speed = speed.map_or(String::new(), |speed| format!(" ({} steps/s)", decimals(Some(speed), 1)));
-    format!("{under_way} {state}{speed}, {ended}")
+    let going = if under_way > 0 { format!("{under_way} {state}{speed}") } else { String::new() };
+    let parts: Vec<_> = [going, ended].into_iter().filter(|part| !part.is_empty()).collect();
+    if parts.is_empty() { "none yet".to_owned() } else { parts.join(", ") }
 }
 
 fn write_candidates(
@@ -211,23 +217,9 @@ fn write_candidates(
     shared: Option<u64>,
 ) -> io::Result<()> {
     let Candidates { seen, accepted, declined, control, rejected_by_guards } = candidates;
-    let mut reasons = vec![
-        ("covered", declined.covered),
-        ("duplicate", declined.duplicate),
-        ("too close", declined.too_close),
-        ("budget", declined.budget),
-        ("backlog", declined.backlog),
-    ];
-    if declined.unlikely_to_complete > 0 {
-        reasons.push(("unlikely to complete", declined.unlikely_to_complete));
-    }
-    if declined.grade_too_large > 0 {
-        reasons.push(("grade too large", declined.grade_too_large));
-    }
-    let all: u64 = reasons.iter().map(|(_, count)| count).sum();
-    let reasons = reasons.iter().map(|(reason, count)| format!("{count} {reason}"));
-    let reasons = reasons.collect::<Vec<_>>().join(", ");
-    page.titled(out, "candidates", &format!("{seen} seen, {accepted} accepted, {all} declined ({reasons})"))?;
+    let is_shown = |number: u64| number > 0 || page.is_unlimited();
+    let declined = candidates::declined(declined, page.is_unlimited());
+    page.titled(out, "candidates", &format!("{seen} seen, {accepted} accepted{declined}"))?;
     let shared = match shared {
         None | Some(0) => String::new(),
         Some(shared) if page.is_unlimited() => format!(
@@ -236,10 +228,15 @@ fn write_candidates(
         ),
         Some(shared) => format!(" ({shared} also biased)"),
     };
-    let control = count(*control, "control frame");
-    let left_out = match left_out {
-        0 => String::new(),
-        left_out => format!("; {left_out} left out (the decision log has the reasons)"),
-    };
-    page.titled(out, "", &format!("{control}{shared}; {rejected_by_guards} rejected by guards{left_out}"))
+    let mut parts = Vec::new();
+    if is_shown(*control) {
+        parts.push(format!("{}{shared}", count(*control, "control frame")));
+    }
+    if is_shown(*rejected_by_guards) {
+        parts.push(format!("{rejected_by_guards} rejected by guards"));
+    }
+    if left_out > 0 {
+        parts.push(format!("{left_out} left out (the decision log has the reasons)"));
+    }
+    if parts.is_empty() { Ok(()) } else { page.titled(out, "", &parts.join("; ")) }
 }

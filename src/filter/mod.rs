@@ -17,6 +17,8 @@ pub use parse::FilterError;
 pub struct StructureProperties<'a> {
     /// Largest γ under the original mixture.
     pub gamma: Option<f64>,
+    /// Largest γ under the current mixture: the selector's at the decision, or that of a walk's walker.
+    pub gamma_current: Option<f64>,
     /// Largest γ_nbr under the original mixture.
     pub gamma_nbr: Option<f64>,
     /// V/V₀.
@@ -100,7 +102,7 @@ macro_rules! names {
 names! {
     /// Numeric properties.
     NumberField {
-        Gamma "gamma", GammaNbr "gamma_nbr", RelativeVolume "relative_volume", Temperature "temperature",
+        Gamma "gamma", GammaCurrent "gamma_current", GammaNbr "gamma_nbr", RelativeVolume "relative_volume", Temperature "temperature",
         KineticTemperature "kinetic_temperature", Tau "tau", Version "version", Walk "walk", Step "step",
         MixtureVersion "mixture_version", Atoms "atoms", Energy "energy", EnergyPerAtom "energy_per_atom",
         MaxForce "max_force", Fragments "fragments"
@@ -172,6 +174,7 @@ impl StructureProperties<'_> {
         let atoms = (!self.species.is_empty()).then_some(self.species.len() as f64);
         match field {
             NumberField::Gamma => self.gamma,
+            NumberField::GammaCurrent => self.gamma_current,
             NumberField::GammaNbr => self.gamma_nbr,
             NumberField::RelativeVolume => self.relative_volume,
             NumberField::Temperature => self.conditions.map(|conditions| conditions.temperature),

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use monitor::calibration::{self, CalibrationState};
 use monitor::completion_model::CompletionReport;
 use monitor::end_reason::CampaignEnd;
+use monitor::history::CampaignHistory;
 use monitor::label_statistics::comparison::WalkComparison;
 use monitor::label_statistics::{self, LabelStatistics};
 use monitor::versions::{CampaignVersions, newest_with_labels};
@@ -46,6 +47,8 @@ pub struct ReportData {
     pub versions: CampaignVersions,
     /// `None` without a label protocol.
     pub labels: Option<ProtocolLabels>,
+    /// Samples of the campaign over time.
+    pub history: CampaignHistory,
     /// Start of the campaign, ms since 1970.
     pub started: Option<i64>,
 }
@@ -105,6 +108,7 @@ impl ReportData {
             values: values.collect(),
             fates: store.fates_by_decision(part).await?,
             fates_by_seed_structure: store.fates_by_seed_structure().await?,
+            history: CampaignHistory::read(store, 0).await?,
             started: first.first().map(|operation| operation.time),
             campaign,
             seed_structures,

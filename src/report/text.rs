@@ -73,6 +73,7 @@ fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [PageTa
         (
             "Cost, failures and unlabelled structures",
             blocks(vec![
+                numbered("history"),
                 numbered("cost"),
                 table("failures"),
                 numbered("completion"),

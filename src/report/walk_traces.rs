@@ -29,11 +29,7 @@ pub static QUANTITIES: [TraceQuantity; 9] = [
     TraceQuantity { key: "pressure", title: "pressure (GPa)", of: |point| point.pressure },
     TraceQuantity { key: "relative_volume", title: "V/V_{0}", of: |point| Some(point.relative_volume) },
     TraceQuantity { key: "gamma_max", title: "γ_{max}", of: |point| point.gamma_max },
-    TraceQuantity {
-        key: "gamma_max_original",
-        title: "γ_{max}, original",
-        of: |point| point.gamma_max_original,
-    },
+    TraceQuantity { key: "gamma_max_original", title: "γ_{0,max}", of: |point| point.gamma_max_original },
     TraceQuantity { key: "bias_scale", title: "τ_{r} (eV)", of: |point| Some(point.bias_scale) },
     TraceQuantity { key: "cell_gain", title: "τ_{s}", of: |point| Some(point.cell_gain) },
     TraceQuantity {

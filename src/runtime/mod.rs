@@ -3,6 +3,7 @@
 pub mod agent_host;
 pub mod agent_model;
 mod agent_service;
+pub mod campaign_watch;
 mod db_status;
 mod device_watch;
 mod label_order;
@@ -41,6 +42,7 @@ use crate::campaign::LoadedCampaign;
 use crate::config::{Config, QueueFull};
 use crate::exit_status::CommandError;
 use crate::forgetting::ForgettingRule;
+use crate::label_line::LabelLine;
 use crate::output::count;
 use crate::progress::RunDisplay;
 use crate::python_model;
@@ -63,6 +65,8 @@ pub struct RunContext<'a> {
     pub directory: &'a Path,
     /// Where agents of other hosts may join.
     pub listen: Option<&'a Listen>,
+    /// The line about labels that are being made.
+    pub labels: &'a LabelLine,
     /// Cancelled to stop the run: by a signal, or when a time limit is reached.
     pub stop: &'a CancellationToken,
     /// Cancelled when walks make room for those of a newer version of the potential, which do not wait for labels.
@@ -137,7 +141,8 @@ fn start_reactor(
     let mut ends = WalkEnds::default();
     selector.ended_walks().for_each(|(walk, end, reason)| ends.add(walk.0, end, reason));
     let (walks, forgetting) = (selector.walk_progress(walk_steps), ForgettingRule::new(&config.calm));
-    let mut display = RunDisplay::new(walk_steps, walks, ends, forgetting, run.stop.clone());
+    let mut display =
+        RunDisplay::new(walk_steps, walks, ends, forgetting, run.stop.clone(), run.labels.clone());
     let queue_limit = u64::from(config.label.queue_limit.get());
     if config.label.on_queue_full == QueueFull::Raise {
         selector.raise_threshold_above(queue_limit);

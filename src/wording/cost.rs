@@ -1,14 +1,25 @@
 //! Costs of labels, in words.
 
-use monitor::label_cost::{CoreHours, RelabelCost};
+use monitor::label_cost::{CoreHours, RelabelCost, SECONDS_PER_HOUR};
 
 use crate::campaign::WalkTime;
 use crate::output::count;
 
 /// The expected value with its interval.
 pub fn core_hours(hours: &CoreHours) -> String {
-    let [expected, low, high] = [hours.expected, hours.low, hours.high].map(two_digits);
-    format!("{expected} core-hours (90 % interval: {low} to {high})")
+    let (unit, factor) = core_unit(hours.expected);
+    let [expected, low, high] = [hours.expected, hours.low, hours.high].map(|x| two_digits(factor * x));
+    format!("{expected} {unit} (90 % interval: {low} to {high})")
+}
+
+/// A cost in core-hours, below one in core-seconds.
+pub fn core_time(hours: f64) -> String {
+    let (unit, factor) = core_unit(hours);
+    format!("{} {unit}", two_digits(factor * hours))
+}
+
+fn core_unit(hours: f64) -> (&'static str, f64) {
+    if hours < 1.0 { ("core-seconds", SECONDS_PER_HOUR) } else { ("core-hours", 1.0) }
 }
 
 /// The time of all walks.
@@ -67,6 +78,15 @@ mod tests {
         ] {
             assert_eq!(wall_time(seconds), text);
         }
+    }
+
+    #[test]
+    fn small_costs_are_in_core_seconds() {
+        let texts = [0.0, 2.8e-5, 0.5, 1.0, 1234.0].map(core_time);
+        assert_eq!(
+            texts,
+            ["0 core-seconds", "0.10 core-seconds", "1800 core-seconds", "1.0 core-hours", "1234 core-hours"]
+        );
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 pub mod budget;
 pub mod calibration;
+pub mod candidates;
 pub mod comparison;
 pub mod cost;
 pub mod date;
@@ -11,7 +12,9 @@ pub mod end_reason;
 pub mod energies;
 #[cfg(test)]
 mod glossary;
+pub mod history;
 pub mod json;
+pub mod label_progress;
 pub mod labels;
 pub mod reference_check;
 pub mod unlabelled;

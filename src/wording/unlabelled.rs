@@ -16,7 +16,7 @@ pub fn describe(unlabelled: &[Unlabelled], width: usize, most: usize) -> String 
         "formula",
         ">failed",
         ">of",
-        "γ_max of failed",
+        "γ₀_max of failed",
         "of labelled",
         "V/V₀ of failed",
         "of labelled",

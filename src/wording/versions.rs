@@ -3,7 +3,7 @@
 use monitor::versions::{CampaignVersions, RefitUnderWay, VersionSetErrors, VersionSummary};
 
 use crate::output::{TextTable, count, decimals};
-use crate::wording::cost::two_digits;
+use crate::wording::cost::core_time;
 
 /// The version in force, with those that wait or were refused: `version 2 in force, trained on 120 labels; 1 refused`.
 pub fn in_force(versions: &CampaignVersions, version: &VersionSummary) -> String {
@@ -31,9 +31,9 @@ pub fn refused(version: &VersionSummary) -> String {
 pub fn registered(version: &VersionSummary) -> String {
     let VersionSummary { number, labels, core_hours, .. } = version;
     format!(
-        "version {number} of the potential is registered: trained on {}, {} core-hours",
+        "version {number} of the potential is registered: trained on {}, {}",
         count(*labels, "label"),
-        two_digits(*core_hours)
+        core_time(*core_hours)
     )
 }
 

@@ -9,7 +9,7 @@ pub fn sentence(point: &TracePoint) -> String {
     let mut parts = vec![format!("{:.0} K", point.temperature)];
     parts.extend(point.pressure.map(|pressure| format!("{pressure:.2} GPa")));
     parts.push(format!("V/V₀ {:.4}", point.relative_volume));
-    let original = point.gamma_max_original.map(|gamma| format!(", under the original mixture {gamma:.2}"));
+    let original = point.gamma_max_original.map(|gamma| format!(", γ₀_max {gamma:.2}"));
     parts.push(format!("γ_max {}{}", decimals(point.gamma_max, 2), original.unwrap_or_default()));
     if point.bias_scale != 0.0 {
         let share = 100.0 * point.bias_share;
@@ -36,7 +36,7 @@ mod tests {
         point.pressure = Some(-0.25);
         (point.gamma_max, point.gamma_max_original) = (Some(1.234), Some(2.5));
         (point.bias_scale, point.bias_share, point.bias_work) = (0.5, 0.126, 3.0);
-        let expected = "trace at step 150: 612 K, -0.25 GPa, V/V₀ 1.0000, γ_max 1.23, under the original mixture 2.50, τ_r 0.500 eV, 12.6 % of the force, \
+        let expected = "trace at step 150: 612 K, -0.25 GPa, V/V₀ 1.0000, γ_max 1.23, γ₀_max 2.50, τ_r 0.500 eV, 12.6 % of the force, \
                         work of the bias so far 3.00 eV";
         assert_eq!(sentence(&point), expected);
     }

@@ -72,6 +72,8 @@ pub enum ExportSource {
         mixture_version_after: u64,
         /// All data of the walker (walk, segment, step, mixture version, the potential's forces), without features.
         block: CandidateBlock,
+        /// Largest γ under the selector's mixture at the decision, before the update.
+        selector_gamma: Option<f64>,
         /// γ and γ_nbr under the original mixture.
         original: AtomGrades,
     },

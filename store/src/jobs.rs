@@ -125,6 +125,8 @@ pub struct QueueEntry {
     pub atoms: u32,
     /// Formula.
     pub formula: String,
+    /// Largest γ under the selector's mixture at the decision, before the update.
+    pub selector_gamma: Option<f64>,
     /// Largest γ under the original mixture.
     pub original_gamma: Option<f64>,
     /// Largest γ_nbr under the original mixture.
@@ -151,6 +153,13 @@ pub struct QueueEntry {
     pub value_factors: Option<serde_json::Value>,
     /// Why its label is excluded from the data set; `None` if it is not.
     pub excluded: Option<String>,
+}
+
+impl Attempt {
+    /// Whether it ended with a result.
+    pub fn made_label(&self) -> bool {
+        matches!(self.outcome.as_deref(), Some("labelled" | "check"))
+    }
 }
 
 /// An attempt at a job.

@@ -19,6 +19,7 @@ mod exclude;
 mod export;
 mod file_names;
 mod filesystem;
+mod history;
 mod jobs;
 mod label_values;
 mod listing;
@@ -36,6 +37,7 @@ mod recent;
 pub mod records;
 mod relabel;
 mod report;
+mod running_labels;
 mod sqlite;
 mod status;
 mod store;
@@ -57,6 +59,7 @@ pub use exclude::{ExcludedLabel, Exclusion, ExclusionChange};
 pub use export::{ArrivalSum, ExportCursor, ExportFilter, ExportRow, ExportSource, LabelArrival, LabelMark};
 pub use file_names::{DATABASE, LOCK};
 pub use filesystem::{check_directory, free_space, network_file_system};
+pub use history::HistorySample;
 pub use jobs::{
     Attempt, CalculationArchive, CalculationRecord, CompleteOutcome, FailOutcome, ImportCounts, JobDetails,
     LabelRecord, LabelSource, LabelStatus, LeaseStatus, OldestLease, PastCalculation, QueueEntry,
@@ -79,6 +82,7 @@ pub use recent::{DecidedCandidate, RecentDecision};
 pub use records::*;
 pub use relabel::{NewProtocol, RelabelCounts, RelabelRequest, Relabellable};
 pub use report::{CollectedStructure, FateCount};
+pub use running_labels::RunningLabel;
 pub use status::{CampaignStatus, Candidates, Declined, LabelJobCounts, WalkStatus};
 pub use store::Store;
 pub use versions::{VersionFiles, VersionRecord, VersionState, WalkVersions};

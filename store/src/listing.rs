@@ -58,6 +58,8 @@ pub struct ListedCandidate {
     pub relative_volume: Option<f64>,
     /// Largest γ under the mixture that its walker saw.
     pub walker_gamma: Option<f64>,
+    /// Largest γ under the selector's mixture at the decision, before the update.
+    pub selector_gamma: Option<f64>,
     /// Largest γ under the original mixture.
     pub gamma: Option<f64>,
     /// Largest γ_nbr under the original mixture.

@@ -137,8 +137,10 @@ pub struct WalkStatus {
     pub temperature: Option<f64>,
     /// V / V₀.
     pub relative_volume: Option<f64>,
-    /// Largest γ of the last graded step.
+    /// Largest γ of the last graded step, under the mixture that its walker has.
     pub gamma_max: Option<f64>,
+    /// Largest γ under the original mixture, at the last point of its trace.
+    pub gamma_max_original: Option<f64>,
     /// Steps per second, including the time between assignments; `None` without a report in the last minute, while
     /// it is paused or while nothing runs the campaign.
     pub steps_per_second: Option<f64>,
@@ -164,6 +166,7 @@ impl FromRow for WalkStatus {
             // Other tables have them.
             reference_step: None,
             reference_volume: None,
+            gamma_max_original: None,
             walk: row.get("walk")?,
             seed_structure: row.get("seed_structure")?,
             conditions: None,

@@ -7,6 +7,8 @@ use crate::numbers::{decode_numbers, encode_numbers};
 
 /// Number of quantities of a point. Later versions add theirs at the end: the column says how many it has.
 const QUANTITIES: usize = 20;
+/// Bytes of a point in the column; the last quantity is γ_max under the original mixture.
+pub(crate) const POINT_BYTES: i64 = (QUANTITIES * size_of::<f64>()) as i64;
 /// That of the first version, without γ_max under the original mixture.
 const FIRST_QUANTITIES: usize = 19;
 /// Whole numbers above are not exact in a column of f64.

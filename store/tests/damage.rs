@@ -399,7 +399,7 @@ async fn a_database_of_an_earlier_version_gets_checksums() {
 /// Turns it into a database of version 8 by undoing what later versions add and rename.
 async fn without_checksums(directory: &Path) {
     let mut connection = connect(directory).await;
-    let mut sql = "DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
+    let mut sql = "DROP TABLE sample; DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
     DROP TABLE walk_trace; DROP INDEX job_order; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
         CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
         DROP TABLE version_file; DROP TABLE version;

@@ -118,7 +118,7 @@ async fn a_campaign_of_version_1_continues() {
     let directory = tempfile::tempdir().unwrap();
     let log = version_1(directory.path()).await;
     let store = Store::open(directory.path()).await.unwrap();
-    assert_eq!(version(directory.path()).await, 21);
+    assert_eq!(version(directory.path()).await, 22);
     assert_eq!(store.decision_log_text().await.unwrap(), log);
     assert_eq!((store.status().await.unwrap().candidates.accepted, counts(directory.path()).await), (2, 2));
     assert_eq!(job_counts(directory.path()).await, [("leased".into(), 1), ("queued".into(), 1)]);
@@ -146,7 +146,7 @@ async fn columns_of_version_13_are_read_under_their_former_names_and_renamed() {
     store.upsert_process(&process).await.unwrap();
     store.close().await;
     let mut connection = connect(&directory.path().join(DATABASE)).await;
-    let sql = "DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
+    let sql = "DROP TABLE sample; DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
     DROP TABLE walk_trace; DROP INDEX job_order; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
         CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
         DROP TABLE version_file; DROP TABLE version;
@@ -157,7 +157,7 @@ async fn columns_of_version_13_are_read_under_their_former_names_and_renamed() {
         DELETE FROM _sqlx_migrations WHERE version > 13;";
     sqlx::raw_sql(sql).execute(&mut connection).await.unwrap();
     connection.close().await.unwrap();
-    for (writes, expected) in [(false, 13), (true, 21)] {
+    for (writes, expected) in [(false, 13), (true, 22)] {
         let path = directory.path();
         let store = if writes { Store::open(path).await } else { Store::open_read_only(path).await }.unwrap();
         assert_eq!(store.load_walks().await.unwrap(), walks);
@@ -206,7 +206,7 @@ async fn a_campaign_of_version_16_has_no_versions_of_the_potential() {
     sqlx::raw_sql(TO_VERSION_16).execute(&mut connection).await.unwrap();
     sqlx::raw_sql("PRAGMA user_version = 16").execute(&mut connection).await.unwrap();
     connection.close().await.unwrap();
-    for (writes, expected) in [(false, 16), (true, 21)] {
+    for (writes, expected) in [(false, 16), (true, 22)] {
         let path = directory.path();
         let store = if writes { Store::open(path).await } else { Store::open_read_only(path).await }.unwrap();
         assert_eq!(store.versions().await.unwrap(), []);
@@ -232,7 +232,7 @@ async fn jobs_of_version_17_have_no_values() {
     sqlx::raw_sql(TO_VERSION_17).execute(&mut connection).await.unwrap();
     sqlx::raw_sql("PRAGMA user_version = 17").execute(&mut connection).await.unwrap();
     connection.close().await.unwrap();
-    for (writes, expected) in [(false, 17), (true, 21)] {
+    for (writes, expected) in [(false, 17), (true, 22)] {
         let path = directory.path();
         let store = if writes { Store::open(path).await } else { Store::open_read_only(path).await }.unwrap();
         let jobs = store.queue_list(Some(JobState::Queued), 9, 0).await.unwrap();

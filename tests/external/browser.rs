@@ -134,7 +134,7 @@ fn nothing_is_cut_off_and_errors_are_shown_by_grade() {
 
 /// All plots over time have the same axis, whichever values they show.
 fn same_time(browser: &Browser) {
-    let axes = "[...document.querySelectorAll('figure svg[role=img]')].filter((one) => one.textContent.includes('time before now'))\
+    let axes = "[...document.querySelectorAll('figure svg[role=img]')].filter((one) => one.textContent.includes('local time'))\
                 .map((one) => [...one.querySelectorAll('.grid text[text-anchor=middle]')].map((tick) => tick.textContent).join(' '))";
     let axes: Vec<String> = serde_json::from_value(browser.run(&format!("return {axes}"))).unwrap();
     assert!(axes.len() > 1 && axes.windows(2).all(|pair| pair[0] == pair[1]), "{axes:?}");
@@ -234,7 +234,7 @@ fn table(browser: &Browser, page: &str) {
     // Sort with the keyboard; the focus stays on the button.
     browser.run("document.querySelector('button.sort[data-keep=gamma]').focus()");
     browser.press(&[ENTER]);
-    browser.wait("document.querySelector('th[aria-sort=descending]')?.textContent.includes('γ_max')");
+    browser.wait("document.querySelector('th[aria-sort=descending]')?.textContent.includes('γ₀_max')");
     assert_eq!(browser.run("return document.activeElement.dataset.keep"), "gamma");
     let found: Vec<f64> = serde_json::from_value(browser.run(&format!("return {column}"))).unwrap();
     assert!(found.len() > 2 && found.is_sorted_by(|a, b| a >= b), "{found:?}");

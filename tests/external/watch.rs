@@ -208,7 +208,7 @@ fn queued_structures_are_changed_and_candidates_explained() {
     let queued = queue(&place, "queued");
     let short = |job: &Value| job["candidate"].as_str().unwrap().split_once('-').unwrap().1.to_owned();
     let terminal = Terminal::open(&place, "queue", (100, 40), "NO_COLOR=1");
-    terminal.wait_for_all(&["not running", &format!("2 queue: {}", queued.len()), "accepted", "γ_max of "]);
+    terminal.wait_for_all(&["not running", &format!("2 queue: {}", queued.len()), "accepted", "γ₀_max of "]);
     let colours = terminal.wait_for_sequence(";7m");
     assert!(!colours.contains("[38;5;"), "{colours:?}");
 

@@ -1,5 +1,6 @@
 //! Tables of the report, for the terminal and for pages.
 
+use atoms::units::GPA_PER_EV_A3;
 use std::io::{self, Write};
 
 use analysis::SHOWN_ERROR_THRESHOLDS;
@@ -59,18 +60,18 @@ pub fn write_table(table: &PageTable, out: &mut dyn Write) -> io::Result<()> {
 }
 
 fn errors(report: &LabelledReport) -> PageTable {
-    let row = |name: &str, of: &MeanErrors| {
+    let row = |name: &str, of: &MeanErrors, factor: f64, decimals: usize| {
         let mut row = vec![text(name), count(of.number as u64)];
         for estimate in [of.mean_absolute, of.root_mean_square] {
-            row.extend(cells(estimate, 1000.0, 2));
+            row.extend(cells(estimate, factor, decimals));
         }
         (of.number > 0.0).then_some(row)
     };
     let rows = [
-        row("energy (meV/atom)", &report.energy),
-        row("energy without offsets of elements", &report.energy_without_offsets),
-        row("force components (meV/Å)", &report.forces),
-        row("stress components (meV/Å³)", &report.stress),
+        row("energy (meV/atom)", &report.energy, 1000.0, 2),
+        row("energy without offsets of elements", &report.energy_without_offsets, 1000.0, 2),
+        row("force components (meV/Å)", &report.forces, 1000.0, 2),
+        row("stress components (GPa)", &report.stress, GPA_PER_EV_A3, 3),
     ];
     let caption = format!("Errors of the model against the labels, {}", intervals(report));
     let titles = ["", "number", "MAE", INTERVAL, "RMSE", INTERVAL];

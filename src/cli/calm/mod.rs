@@ -14,6 +14,7 @@ mod sample;
 mod score;
 mod score_calibration;
 mod score_labels;
+mod score_list;
 mod score_table;
 mod scorer;
 mod validate;

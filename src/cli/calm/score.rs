@@ -12,6 +12,7 @@ use npyz::{NpyWriter, WriterBuilder};
 use super::other_scores::{OtherScoreError, OtherScores};
 use super::score_calibration::{self, ScoreCalibration};
 use super::score_labels::ScoreLabels;
+use super::score_list::ScoreList;
 use super::scorer::Scorer;
 use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, cannot_write, check_outputs, refuse_to_replace};
@@ -40,6 +41,8 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 ///
 /// Keeps all other data of the frame. Renames its energy, forces, stress and virial to REF_energy, REF_forces and so on, unless
 /// it already has reference labels; then it replaces the plain ones, which come from another model.
+///
+/// Prints γ_max, the number of atoms with γ > 1 and the worst atom of each structure; of more than 20 structures those with the largest γ_max.
 ///
 /// If frames have labels, also prints the errors of the model, and how well γ and γ_nbr of an atom predict large force errors:
 /// Spearman's ρ, ROC-AUC, what γ ≤ 1 keeps, and quantiles by bins of γ, with intervals by bootstrap over structures.
@@ -93,6 +96,9 @@ pub struct CalmScoreArgs {
     /// --calibration`. Model and artifact must be those of a version of the campaign's potential
     #[arg(long, value_name = "DIR|FILE.json")]
     calibration: Option<PathBuf>,
+    /// Print a line for every structure [default: the 20 with the largest γ_max]
+    #[arg(long)]
+    all: bool,
 }
 
 impl CalmScoreArgs {
@@ -118,6 +124,7 @@ impl CalmScoreArgs {
         let mut matrix = matrix.transpose().map_err(cannot)?;
         let mut labels = ScoreLabels::new(others.score_columns(), self.table.as_deref(), bounds.is_some())?;
         let (mut count, mut left_out) = (0_u64, LeftOutStructures::default());
+        let mut list = ScoreList::new(self.all);
         while let Some((mut frame, _)) = frames.next()? {
             let line = frame.line;
             let graded = scorer.score(&frame.structure, self.gradient).map_err(OtherScoreError::from);
@@ -130,6 +137,7 @@ impl CalmScoreArgs {
                 Err(error) => return Err(self.at(line, error)),
             };
             let bound = bounds.as_mut().and_then(|bounds| bounds.bound(&frame.structure, &scorer.gamma_nbr));
+            list.add(&frame, &scorer);
             labels.add(&frame, &scorer, &columns, bound)?;
             write_scores(&mut frame, &scorer, self.gradient);
             if let Some(bound) = bound {
@@ -158,6 +166,7 @@ impl CalmScoreArgs {
                 self.output.display()
             )
         })?;
+        print(|out| list.write(out))?;
         if let Some(bounds) = &bounds {
             print(|out| writeln!(out, "{}", bounds.note()))?;
         }

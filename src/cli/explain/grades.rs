@@ -10,7 +10,7 @@ use crate::output::{TextTable, count, decimals};
 pub fn write(out: &mut dyn Write, grades: &CandidateGrades) -> io::Result<()> {
     let mut table = TextTable::new(&["mixture", ">version", ">γ_max", ">γ_nbr max", ">atoms γ > 1"]);
     for (name, grade) in
-        [("walker's", &grades.walker), ("selector's", &grades.selector), ("original", &grades.original)]
+        [("walker's", &grades.walker), ("selector's", &grades.selector), ("original (γ₀)", &grades.original)]
     {
         table.push(vec![
             name.to_owned(),
@@ -52,10 +52,10 @@ fn write_trigger(out: &mut dyn Write, trigger: &Trigger, grades: &CandidateGrade
         "element",
         ">γ walker's",
         ">selector's",
-        ">original",
+        ">γ₀",
         ">γ_nbr walker's",
         ">selector's",
-        ">original",
+        ">γ₀_nbr",
     ]);
     triggered.iter().take(SHOWN).for_each(|atom| table.push(row(atom)));
     block(out, "", &table)?;

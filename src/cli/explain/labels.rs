@@ -3,24 +3,27 @@
 use std::io::{self, Write};
 
 use monitor::candidate_details::{CandidateDetails, CandidateLabel, ForceError, LabelJob};
+use monitor::label_cost::SECONDS_PER_HOUR;
 use store::{Attempt, Exclusion, QueueEntry, Supersession, unix_milliseconds};
 
 use super::line;
 use crate::output::count;
 use crate::wording;
+use crate::wording::cost::{core_time, wall_time};
 
 /// Lines printed from the end of a log.
 const LOG_LINES: usize = 10;
 
-pub fn write(out: &mut dyn Write, details: &CandidateDetails) -> io::Result<()> {
+/// `all`: also the logs of attempts that did not fail.
+pub fn write(out: &mut dyn Write, details: &CandidateDetails, all: bool) -> io::Result<()> {
     if details.jobs.is_empty() && details.labels.is_empty() {
         return line(out, "label", "no label job: only accepted candidates and control frames get one");
     }
-    details.jobs.iter().try_for_each(|job| write_job(out, job))?;
+    details.jobs.iter().try_for_each(|job| write_job(out, job, all))?;
     details.labels.iter().try_for_each(|label| write_label(out, label, details.structure.atoms))
 }
 
-fn write_job(out: &mut dyn Write, job: &LabelJob) -> io::Result<()> {
+fn write_job(out: &mut dyn Write, job: &LabelJob, all: bool) -> io::Result<()> {
     let QueueEntry {
         job: number,
         protocol,
@@ -33,7 +36,9 @@ fn write_job(out: &mut dyn Write, job: &LabelJob) -> io::Result<()> {
         relabel,
         ..
     } = &job.details.job;
-    let cost = job.core_seconds.map_or(String::new(), |seconds| format!(", {seconds:.1} core-seconds"));
+    let cost = job
+        .core_seconds
+        .map_or(String::new(), |seconds| format!(", {}", core_time(seconds / SECONDS_PER_HOUR)));
     line(
         out,
         "label job",
@@ -56,20 +61,20 @@ fn write_job(out: &mut dyn Write, job: &LabelJob) -> io::Result<()> {
         let why = done.reason.as_ref().map_or(String::new(), |reason| format!(" ({reason})"));
         line(out, "", &format!("by the user: {}{to}{why}, {} ago", done.action, elapsed_since(done.time)))?;
     }
-    job.details.attempts_made.iter().try_for_each(|attempt| write_attempt(out, attempt))
+    job.details.attempts_made.iter().try_for_each(|attempt| write_attempt(out, attempt, all))
 }
 
-fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
+fn write_attempt(out: &mut dyn Write, attempt: &Attempt, all: bool) -> io::Result<()> {
     let Attempt { attempt: number, holder, started, ended, outcome, class, log, made, core_seconds, .. } =
         attempt;
     let outcome = outcome.as_deref().unwrap_or("running");
     let class = class.as_ref().map_or(String::new(), |class| format!(" ({})", class.replace('_', " ")));
     let lasted = match ended {
-        Some(ended) => format!("after {:.1} s", (ended - started) as f64 / 1000.0),
+        Some(ended) => format!("after {}", wall_time((ended - started) as f64 / 1000.0)),
         None => format!("for {}", elapsed_since(*started)),
     };
     let cost = core_seconds.map_or(String::new(), |seconds| {
-        format!(", {seconds:.1} core-seconds on {}", count(made.cores.unwrap_or(1), "core"))
+        format!(", {} on {}", core_time(seconds / SECONDS_PER_HOUR), count(made.cores.unwrap_or(1), "core"))
     });
     line(out, "", &format!("attempt {number}: {outcome}{class} {lasted}, by {holder}{cost}"))?;
     if let Some(remedies) = &made.remedies {
@@ -77,7 +82,8 @@ fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
     }
     let difference = made.difference.as_deref().unwrap_or_default();
     difference.lines().try_for_each(|changed| line(out, "", &format!("  {changed}")))?;
-    let log: Vec<_> = log.as_deref().unwrap_or_default().lines().collect();
+    let log = log.as_deref().filter(|_| all || !attempt.made_label());
+    let log: Vec<_> = log.unwrap_or_default().lines().collect();
     let tail = &log[log.len().saturating_sub(LOG_LINES)..];
     tail.iter().try_for_each(|text| line(out, "", &format!("  | {text}")))
 }

@@ -44,6 +44,9 @@ pub struct ExplainArgs {
     /// Print JSON, with the grades of every atom (docs/explain.md)
     #[arg(long)]
     json: bool,
+    /// Also print the logs of attempts that made a label
+    #[arg(long)]
+    all: bool,
 }
 
 impl ExplainArgs {
@@ -54,7 +57,7 @@ impl ExplainArgs {
             json["expected_errors"] = serde_json::to_value(&expected).map_err(CommandError::failed)?;
             print_json(&json)?
         } else {
-            print(|out| write(out, &details, expected.as_ref()))?
+            print(|out| write(out, &details, expected.as_ref(), self.all))?
         }
         Ok(ExitStatus::Done)
     }
@@ -63,7 +66,7 @@ impl ExplainArgs {
 /// The output of the command.
 pub async fn text(location: Location, id: &str) -> Result<String, CommandError> {
     let (mut text, (details, expected)) = (Vec::new(), read(location, id).await?);
-    write(&mut text, &details, expected.as_ref()).map_err(CommandError::failed)?;
+    write(&mut text, &details, expected.as_ref(), false).map_err(CommandError::failed)?;
     Ok(String::from_utf8_lossy(&text).into_owned())
 }
 
@@ -82,6 +85,7 @@ fn write(
     out: &mut dyn Write,
     details: &CandidateDetails,
     expected: Option<&ExpectedErrors>,
+    all: bool,
 ) -> io::Result<()> {
     writeln!(out, "{}", details.id)?;
     write_structure(out, &details.structure)?;
@@ -99,7 +103,7 @@ fn write(
         decision::write(out, decision, details.structure.atoms)?;
     }
     write_same(out, details)?;
-    labels::write(out, details)?;
+    labels::write(out, details, all)?;
     let expected = expected.map(wording::calibration::expected).unwrap_or_default();
     for (k, text) in expected.iter().enumerate() {
         line(out, if k == 0 { "expected" } else { "" }, text)?;

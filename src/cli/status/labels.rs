@@ -2,15 +2,15 @@
 
 use std::io::{self, Write};
 
-use monitor::label_cost::QueueCost;
+use monitor::label_cost::{QueueCost, SECONDS_PER_HOUR};
 use monitor::label_queue::{LabelQueue, ProtocolJobs, labels_per_hour};
-use store::{CampaignStatus, FailureCount, LabelJobCounts};
+use store::{CampaignStatus, FailureCount, LabelJobCounts, unix_milliseconds};
 
 use super::page::{StatusLayout, cut};
 use super::processes::since;
 use crate::output::count;
-use crate::wording::cost::{core_hours, two_digits};
-use crate::wording::unlabelled;
+use crate::wording::cost::{core_hours, core_time, two_digits, wall_time};
+use crate::wording::{label_progress, unlabelled};
 
 /// Writes the state of the queue, costs, failures and the structures without labels.
 pub fn write(
@@ -19,7 +19,11 @@ pub fn write(
     page: &StatusLayout,
     status: &CampaignStatus,
 ) -> io::Result<()> {
-    page.titled(out, "labels", &describe_queue(status))?;
+    page.titled(out, "labels", &describe_queue(status, page.is_unlimited()))?;
+    let now = unix_milliseconds();
+    for progress in queue.running.iter().take(page.few) {
+        page.titled(out, "", &label_progress::describe(progress, now))?;
+    }
     if let Some(relabelling) = describe_relabelling(&status.labels) {
         page.titled(out, "", &relabelling)?;
     }
@@ -35,8 +39,13 @@ pub fn write(
         let protocols: Vec<_> = queue.by_protocol.iter().map(describe_protocol).collect();
         page.titled(out, "protocols", &protocols.join("; "))?;
     }
-    page.titled(out, "", &describe_rate(status))?;
-    page.titled(out, "cost", &describe_cost(&queue.cost, status.budget.used.core_hours))?;
+    if page.is_unlimited() || (!status.finished && status.labels_last_hour > 0) {
+        page.titled(out, "", &describe_rate(status))?;
+    }
+    let used = status.budget.used.core_hours;
+    if page.is_unlimited() || used > 0.0 || queue.cost.unfinished > 0 {
+        page.titled(out, "cost", &describe_cost(&queue.cost, used))?;
+    }
     for (k, failure) in queue.failures.iter().take(page.few).enumerate() {
         page.titled(out, if k == 0 { "failures" } else { "" }, &describe_failure(failure))?;
     }
@@ -50,7 +59,7 @@ pub fn write(
 
 fn describe_cost(cost: &QueueCost, used: f64) -> String {
     let QueueCost { unfinished, remaining, hours_left, cores, measured, overhead } = cost;
-    let used = format!("{} core-hours so far", two_digits(used));
+    let used = format!("{} so far", core_time(used));
     let Some(remaining) = remaining else {
         return match unfinished {
             0 => used,
@@ -65,7 +74,9 @@ fn describe_cost(cost: &QueueCost, used: f64) -> String {
         false => String::new(),
     };
     let done = match hours_left {
-        Some(hours) => format!("done in {} h on {}", two_digits(*hours), count(*cores, "core")),
+        Some(hours) => {
+            format!("done in {} on {}", wall_time(hours * SECONDS_PER_HOUR), count(*cores, "core"))
+        }
         None => "no active labellers".to_owned(),
     };
     format!(
@@ -76,19 +87,25 @@ fn describe_cost(cost: &QueueCost, used: f64) -> String {
     )
 }
 
-fn describe_queue(status: &CampaignStatus) -> String {
+/// The number of jobs in each state; `all`: also of states without any.
+pub fn describe_queue(status: &CampaignStatus, all: bool) -> String {
     let LabelJobCounts { queued, leased, labelled, failed, dropped, superseded, excluded, .. } =
         &status.labels;
     let oldest = status.oldest_lease.as_ref();
     let oldest = oldest.map_or(String::new(), |lease| format!(" (oldest for {})", since(lease.started)));
-    let superseded = if *superseded > 0 { format!(", {superseded} superseded") } else { String::new() };
-    let excluded = if *excluded > 0 { format!(", {excluded} labels excluded") } else { String::new() };
-    let imported = status.imported;
-    format!(
-        "{queued} queued, {leased} leased{oldest}, {labelled} labelled, {failed} failed, {dropped} dropped{superseded}{excluded}; \
-         {} imported",
-        count(imported, "structure")
-    )
+    let parts = [
+        (*queued, format!("{queued} queued"), all),
+        (*leased, format!("{leased} leased{oldest}"), all),
+        (*labelled, format!("{labelled} labelled"), all),
+        (*failed, format!("{failed} failed"), all),
+        (*dropped, format!("{dropped} dropped"), all),
+        (*superseded, format!("{superseded} superseded"), false),
+        (*excluded, format!("{} excluded", count(*excluded, "label")), false),
+        (status.imported, format!("{} imported", count(status.imported, "structure")), all),
+    ];
+    let shown = parts.into_iter().filter(|(number, _, always)| *always || *number > 0);
+    let shown: Vec<_> = shown.map(|(_, text, _)| text).collect();
+    if shown.is_empty() { "none yet".to_owned() } else { shown.join(", ") }
 }
 
 /// Structures that are relabelled, and failed attempts at it.

@@ -36,8 +36,12 @@ pub fn write(out: &mut dyn Write, values: &MixtureValues, page: &StatusLayout, m
             &format!("component {number} of {} is forgotten most: σ² × {growth:.2}", of.element),
         )?;
     }
-    // Walks that run one after the other have the newest version by construction.
-    match values.staleness().filter(|staleness| mode == "live" || staleness.largest() > 0) {
+    // Walks that run one after the other have the newest version by construction; one version behind is usual beside others.
+    let is_worth_it = |largest: u64| mode == "live" || largest > 0;
+    match values.staleness().filter(|staleness| match page.is_unlimited() {
+        true => is_worth_it(staleness.largest()),
+        false => staleness.quantile(0.9) > 1,
+    }) {
         Some(staleness) => page.titled(
             out,
             "",

@@ -1,13 +1,18 @@
 //! Layout of `calmwalk status`: how much is shown, and how wide.
 
+use std::collections::HashSet;
 use std::io::{self, IsTerminal, Write};
+
+use ratatui::crossterm::terminal;
 
 use crate::output::{self, TextTable};
 
 /// Width of titles, columns.
 const TITLE: usize = 12;
-/// Width of the output on a terminal, and otherwise.
-const WIDTHS: [usize; 2] = [80, usize::MAX];
+/// Least width of the output on a terminal.
+const WIDTH: usize = 80;
+/// Most characters of a name, unless everything is shown.
+const LONGEST_NAME: usize = 30;
 /// Height of a screen, lines.
 const HEIGHT: usize = 40;
 /// Lines of a table without its rows.
@@ -31,8 +36,12 @@ pub struct StatusLayout {
 impl StatusLayout {
     /// No limits, except for the width of a terminal.
     pub fn unlimited() -> Self {
-        let (is_screen, all) = (io::stdout().is_terminal(), usize::MAX);
-        Self { walks: all, others: all, few: all, width: WIDTHS[usize::from(!is_screen)] }
+        let all = usize::MAX;
+        let width = match io::stdout().is_terminal() {
+            true => terminal::size().map_or(WIDTH, |(columns, _)| WIDTH.max(columns.into())),
+            false => all,
+        };
+        Self { walks: all, others: all, few: all, width }
     }
 
     /// Limits for the lists above the tables; [`StatusLayout::fitted`] sets those of the tables.
@@ -92,6 +101,26 @@ pub fn cut(text: &str, width: usize) -> String {
     text.chars().take(width.saturating_sub(1)).chain(['…']).collect()
 }
 
+/// Leaves out the middle of a text of more than `width` characters: names often differ at their ends.
+pub fn cut_middle(text: &str, width: usize) -> String {
+    let length = text.chars().count();
+    if length <= width {
+        return text.to_owned();
+    }
+    let last = width.saturating_sub(1) / 2;
+    let first = width.saturating_sub(1 + last);
+    text.chars().take(first).chain(['…']).chain(text.chars().skip(length - last)).collect()
+}
+
+/// The least width from `least` on at which [`cut_middle`] leaves different names different.
+pub fn name_width<'a>(names: impl Iterator<Item = &'a str>, least: usize) -> usize {
+    let names: HashSet<&str> = names.collect();
+    let differ = |width: &usize| {
+        names.iter().map(|name| cut_middle(name, *width)).collect::<HashSet<_>>().len() == names.len()
+    };
+    (least..LONGEST_NAME).find(differ).unwrap_or(LONGEST_NAME)
+}
+
 /// Parses the number of walks to show: a number, or `all`.
 pub fn parse_walks(text: &str) -> Result<usize, String> {
     match text {
@@ -113,6 +142,10 @@ mod tests {
             "labels      1 queued, 2\n            leased,\n            extraordinarily\n            long\n";
         assert_eq!(String::from_utf8(text).unwrap(), expected);
         assert_eq!((cut("γγγγ", 3), cut("γγγ", 3)), ("γγ…".into(), "γγγ".into()));
+        assert_eq!((cut_middle("abcdefgh", 5), cut_middle("abc", 3)), ("ab…gh".into(), "abc".into()));
+        let names = ["slab-100-vacancy", "slab-110-vacancy"];
+        assert_eq!(name_width(names.into_iter(), 6), 12);
+        assert_ne!(cut_middle(names[0], 12), cut_middle(names[1], 12));
         assert_eq!((parse_walks("all"), parse_walks("12")), (Ok(usize::MAX), Ok(12)));
         assert!(parse_walks("few").is_err());
     }

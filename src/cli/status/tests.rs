@@ -6,6 +6,7 @@ use std::path::Path;
 use monitor::disk::DiskForecast;
 use monitor::end_reason::CampaignEnd;
 use monitor::label_cost::{CoreHours, QueueCost};
+use monitor::label_progress::LabelProgress;
 use monitor::label_queue::LabelQueue;
 use monitor::mixture_values::MixtureValues;
 use monitor::provenance::Provenance;
@@ -15,7 +16,7 @@ use serde_json::{Value, json};
 use store::records::{STALENESS, TRAINING_FRAMES};
 use store::{
     Budget, BudgetStatus, BudgetUse, Declined, FailureCount, LabelJobCounts, OldestLease, ProcessRecord,
-    Unlabelled, ValueRange, WalkStatus, unix_milliseconds,
+    RunningLabel, Unlabelled, ValueRange, WalkStatus, unix_milliseconds,
 };
 use wire::{CampaignId, DeviceStatistics, WalkConditions};
 
@@ -91,6 +92,21 @@ pub fn large() -> Snapshot {
             failures: ["not_converged", "out_of_memory", "implausible"].map(failure).into(),
             unlabelled: vec![unlabelled],
             by_protocol: Vec::new(),
+            running: vec![LabelProgress {
+                label: RunningLabel {
+                    job: 17,
+                    candidate: "07070707-1.0.5-0123456789abcdef".into(),
+                    protocol: "dft".into(),
+                    seed_structure: 0,
+                    formula: "Mo54".into(),
+                    atoms: 54,
+                    attempt: 2,
+                    holder: "node7-17-0/3".into(),
+                    started: 0,
+                    cores: Some(64),
+                },
+                expected_seconds: Some(3600.0),
+            }],
             shared: Some(12),
         },
         end_reason: Some(CampaignEnd::Budget { key: "budget.labels".into() }),

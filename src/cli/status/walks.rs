@@ -6,15 +6,25 @@ use std::io::{self, Write};
 use store::WalkStatus;
 use wire::conditions::VariedConditions;
 
-use super::page::{StatusLayout, cut};
+use super::page::{StatusLayout, cut_middle, name_width};
 use crate::output::{TextTable, decimals};
 
-/// Width of the name of a seed structure, unless everything is shown.
-pub const NAME: usize = 14;
+/// Least width of the name of a seed structure.
+pub const NAME: usize = 11;
 
 /// Titles of the columns in the format of [`TextTable::new`].
-pub const TITLES: [&str; 9] =
-    [">walk", "seed structure", "state", ">step", ">steps/s", ">T (K)", ">V/V₀", ">γ_max", ">taken"];
+pub const TITLES: [&str; 10] = [
+    ">walk",
+    "seed structure",
+    "state",
+    ">step",
+    ">steps/s",
+    ">T (K)",
+    ">V/V₀",
+    ">γ_max",
+    ">γ₀_max",
+    ">taken",
+];
 
 /// Selects at most `most` walks, in order of their numbers: running walks with the largest γ first, then those that started
 /// last.
@@ -45,11 +55,16 @@ pub fn write(
     }
     let mut table = TextTable::new(&TITLES);
     let varied = VariedConditions::among(walks.iter().filter_map(|walk| walk.conditions.as_ref()));
-    let name = if page.walks == usize::MAX { usize::MAX } else { NAME };
+    let name = if page.walks == usize::MAX { usize::MAX } else { width_of_names(walks) };
     for walk in &shown {
         table.push(line(walk, &varied, run_active, name));
     }
     page.table(out, &table, shown.len(), walks.len(), "walks")
+}
+
+/// The width at which names of seed structures are cut, so that they still differ.
+pub fn width_of_names(walks: &[WalkStatus]) -> usize {
+    name_width(walks.iter().map(|walk| walk.seed_structure.as_str()), NAME)
 }
 
 /// The row of a walk below [`TITLES`], with at most `name` characters of its name. `varied`: the conditions that
@@ -57,7 +72,7 @@ pub fn write(
 pub fn line(walk: &WalkStatus, varied: &VariedConditions, run_active: bool, name: usize) -> Vec<String> {
     let control = if walk.origin == "control" { "c: " } else { "" };
     let conditions = walk.conditions.as_ref().map_or(String::new(), |conditions| varied.describe(conditions));
-    let of_seed = cut(&format!("{control}{}", walk.seed_structure), name);
+    let of_seed = format!("{control}{}", cut_middle(&walk.seed_structure, name));
     let name = if conditions.is_empty() { of_seed } else { format!("{of_seed} ({conditions})") };
     let state = match walk.state.as_str() {
         _ if walk.paused => "paused".to_owned(),
@@ -74,6 +89,7 @@ pub fn line(walk: &WalkStatus, varied: &VariedConditions, run_active: bool, name
         decimals(walk.temperature, 0),
         decimals(walk.relative_volume, 3),
         decimals(walk.gamma_max, 2),
+        decimals(walk.gamma_max_original, 2),
         walk.accepted.to_string(),
     ]
 }

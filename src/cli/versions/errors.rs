@@ -1,5 +1,6 @@
 //! The errors of versions, as refits have recorded them.
 
+use atoms::units::GPA_PER_EV_A3;
 use serde_json::{Value, json};
 use store::VersionRecord;
 
@@ -24,8 +25,8 @@ const QUANTITIES: [ErrorQuantity; 6] = [
     quantity("energy_rmse", "energy RMSE (meV/atom)", 1000.0, 2),
     quantity("force_mae", "force MAE (eV/Å)", 1.0, 4),
     quantity("force_rmse", "force RMSE (eV/Å)", 1.0, 4),
-    quantity("stress_mae", "stress MAE (eV/Å³)", 1.0, 6),
-    quantity("stress_rmse", "stress RMSE (eV/Å³)", 1.0, 6),
+    quantity("stress_mae", "stress MAE (GPa)", GPA_PER_EV_A3, 4),
+    quantity("stress_rmse", "stress RMSE (GPa)", GPA_PER_EV_A3, 4),
 ];
 
 const fn quantity(key: &'static str, title: &'static str, factor: f64, decimals: usize) -> ErrorQuantity {

@@ -9,7 +9,7 @@ use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::style::{Color, Modifier, Style};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Paragraph, Sparkline};
-use store::{Candidates, LabelJobCounts};
+use store::Candidates;
 
 use super::entries;
 use super::messages::WINDOW;
@@ -122,7 +122,6 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &WatchState, versions: Op
     let speed = status.steps_per_second.filter(|_| under_way > 0);
     let speed = speed.map_or(String::new(), |speed| format!("; {speed:.1} steps/s"));
     let Candidates { seen, accepted, control, .. } = &status.candidates;
-    let LabelJobCounts { queued, leased, labelled, failed, .. } = &status.labels;
     let lines = [
         ("campaign", format!("{}, {} mode: {}", campaign.id, campaign.mode, cli_status::state(status))),
         (
@@ -134,18 +133,25 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &WatchState, versions: Op
         ),
         (
             "candidates",
-            format!(
-                "{seen} seen, {accepted} accepted, {} declined; {}",
-                seen - accepted,
-                count(*control, "control frame")
-            ),
+            [
+                (*seen, format!("{seen} seen")),
+                (*seen, format!("{accepted} accepted")),
+                (seen - accepted, format!("{} declined", seen - accepted)),
+                (*control, count(*control, "control frame")),
+            ]
+            .into_iter()
+            .filter_map(|(number, text)| (number > 0).then_some(text))
+            .collect::<Vec<_>>()
+            .join(", "),
         ),
         (
             "labels",
-            format!(
-                "{queued} queued, {leased} leased, {labelled} labelled, {failed} failed; {} made in the last hour",
-                status.labels_last_hour
-            ),
+            match status.labels_last_hour {
+                0 => cli_status::describe_queue(status, false),
+                made => {
+                    format!("{}; {made} made in the last hour", cli_status::describe_queue(status, false))
+                }
+            },
         ),
         ("end", cli_status::end(&state.snapshot).unwrap_or_else(|| "–".into())),
     ];
@@ -210,7 +216,7 @@ fn draw_charts(frame: &mut Frame<'_>, area: Rect, state: &WatchState, theme: &Th
     let spread = charts
         .gamma()
         .map_or(String::new(), |(median, largest)| format!(": median {median:.2}, max {largest:.1}"));
-    let title = format!("γ_max of {}{spread}", charts.candidates());
+    let title = format!("γ₀_max of {}{spread}", charts.candidates());
     draw_chart(frame, left, &title, &counts, None, &axis(left.width, end), theme);
     let (shares, group) = charts.acceptance_history(right.width.into());
     let title = match charts.acceptance() {
@@ -315,12 +321,14 @@ fn key_hints(state: &WatchState) -> String {
         },
         (InputMode::Confirm(..), _) => String::new(),
         (InputMode::Panes, WALKS) => {
-            "Tab pane  / filter  Enter decisions  p pause  r resume  i all  ? keys  q quit".into()
+            "Tab pane  / filter  Enter decisions  p pause  r resume  h history  ? keys  q quit".into()
         }
         (InputMode::Panes, QUEUE) => {
             "Tab pane  ↑↓  / filter  Enter open  = priority  d drop  t retry  s view  ? keys".into()
         }
-        (InputMode::Panes, _) => "Tab pane  ↑↓  / filter  Enter open  i all  ? keys  q quit".into(),
+        (InputMode::Panes, _) => {
+            "Tab pane  ↑↓  / filter  Enter open  h history  i all  ? keys  q quit".into()
+        }
     }
 }
 

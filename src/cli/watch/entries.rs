@@ -1,23 +1,34 @@
 //! Walks, label jobs and decisions as entries of the panes, and their quantities for filters.
 
 use atoms::Species;
-use store::{DecidedCandidate, JobState, QueueEntry, RecentDecision, WalkStatus};
+use monitor::label_progress::LabelProgress;
+use store::{DecidedCandidate, JobState, QueueEntry, RecentDecision, WalkStatus, unix_milliseconds};
 use wire::WalkConditions;
 use wire::conditions::VariedConditions;
 
 use super::pane::{PaneEntry, Tone};
-use crate::cli::status::page::cut;
+use crate::cli::status::page::{cut, cut_middle};
 use crate::cli::status::walks;
 use crate::filter::{self, StructureFilter, StructureProperties};
 use crate::output::decimals;
+use crate::wording::label_progress;
 
 /// Columns of the queue: `>` marks numbers, trailing blanks reserve width.
-pub const JOBS: [&str; 7] =
-    ["candidate                 ", "state   ", ">priority", ">atoms", "formula  ", ">γ_max", ">tries"];
+pub const JOBS: [&str; 8] =
+    ["candidate         ", "state   ", ">prio", ">atoms", "formula", ">γ_max", ">γ₀_max", ">tries"];
 
 /// Columns of the decisions.
-pub const DECISIONS: [&str; 8] =
-    [">number", "what               ", ">walk", "seed structure", ">   step", ">T (K)", ">V/V₀", ">γ_max"];
+pub const DECISIONS: [&str; 9] = [
+    ">number",
+    "what             ",
+    ">walk",
+    "seed structure",
+    ">   step",
+    ">T (K)",
+    ">V/V₀",
+    ">γ_max",
+    ">γ₀_max",
+];
 
 /// Quantities that are not available in a pane: of walks, of label jobs, of decisions.
 pub const UNKNOWN_QUANTITIES: [&[&str]; 3] = [
@@ -52,21 +63,24 @@ pub fn walk_entries(
         _ => Tone::Ended,
     };
     let varied = VariedConditions::among(walks.iter().filter_map(|walk| walk.conditions.as_ref()));
+    let width = walks::width_of_names(walks);
     let entry = |walk: &WalkStatus| PaneEntry {
         key: walk.walk.to_string(),
-        columns: walks::line(walk, &varied, run_active, walks::NAME),
+        columns: walks::line(walk, &varied, run_active, width),
         tone: tone(walk),
         candidate: None,
     };
     walks.iter().filter(matches).map(entry).collect()
 }
 
-/// The entries of label jobs that match the filter.
+/// The entries of label jobs that match the filter. `running`: labels under way, which show their time in place of their state.
 pub fn job_entries(
     jobs: &[QueueEntry],
     walks: &[WalkStatus],
+    running: &[LabelProgress],
     filter: Option<&StructureFilter>,
 ) -> Vec<PaneEntry> {
+    let now = unix_milliseconds();
     let matches = |job: &&QueueEntry| {
         let species = filter::species(&job.formula);
         filter.is_none_or(|filter| filter.matches(&facts_of_job(job, &species, walks)))
@@ -80,11 +94,12 @@ pub fn job_entries(
     let entry = |job: &QueueEntry| PaneEntry {
         key: job.job.to_string(),
         columns: vec![
-            without_campaign(&job.candidate).to_owned(),
-            job.state.to_string(),
+            short_candidate(&job.candidate),
+            state_of_job(job, running, now),
             job.priority.to_string(),
             job.atoms.to_string(),
-            cut(&job.formula, 12),
+            cut(&job.formula, 9),
+            decimals(job.selector_gamma, 2),
             decimals(job.original_gamma, 2),
             job.attempts.to_string(),
         ],
@@ -105,10 +120,12 @@ pub fn decision_entries<'a>(
         let species = filter::species(formula);
         filter.is_none_or(|filter| filter.matches(&facts_of_decision(decision, &species, walks)))
     };
-    decisions.filter(matches).map(decision_entry).collect()
+    let width = walks::width_of_names(walks);
+    decisions.filter(matches).map(|decision| decision_entry(decision, width)).collect()
 }
 
-fn decision_entry(decision: &RecentDecision) -> PaneEntry {
+/// `width`: that of names of seed structures.
+fn decision_entry(decision: &RecentDecision, width: usize) -> PaneEntry {
     let RecentDecision { sequence, kind, walk, detail, candidate, .. } = decision;
     let found = candidate.as_ref();
     let number = |of: fn(&DecidedCandidate) -> Option<f64>, digits| match found {
@@ -128,10 +145,11 @@ fn decision_entry(decision: &RecentDecision) -> PaneEntry {
             sequence.to_string(),
             what,
             walk.map_or(String::new(), |walk| walk.to_string()),
-            cut(name.unwrap_or_default(), walks::NAME),
+            cut_middle(name.unwrap_or_default(), width),
             step.map_or(String::new(), |step| step.to_string()),
             number(|found| found.temperature, 0),
             number(|found| found.relative_volume, 3),
+            number(|found| found.selector_gamma, 2),
             number(|found| found.original_gamma, 2),
         ],
         tone: match kind.as_str() {
@@ -148,9 +166,23 @@ pub fn without_campaign(candidate: &str) -> &str {
     candidate.split_once('-').map_or(candidate, |(_, rest)| rest)
 }
 
+fn state_of_job(job: &QueueEntry, running: &[LabelProgress], now: i64) -> String {
+    let progress =
+        running.iter().find(|progress| progress.label.job == job.job && job.state == JobState::Leased);
+    progress.map_or_else(|| job.state.to_string(), |progress| label_progress::short(progress, now))
+}
+
+/// Walk, segment and step of a candidate, with eight digits of its hash.
+fn short_candidate(candidate: &str) -> String {
+    let rest = without_campaign(candidate);
+    rest.rsplit_once('-')
+        .map_or(rest.to_owned(), |(place, hash)| format!("{place}-{}", hash.get(..8).unwrap_or(hash)))
+}
+
 fn facts_of_walk(walk: &WalkStatus) -> StructureProperties<'_> {
     StructureProperties {
-        gamma: walk.gamma_max,
+        gamma: walk.gamma_max_original,
+        gamma_current: walk.gamma_max,
         relative_volume: walk.relative_volume,
         kinetic_temperature: walk.temperature,
         conditions: walk.conditions.as_ref(),
@@ -174,6 +206,7 @@ fn facts_of_job<'a>(
 ) -> StructureProperties<'a> {
     StructureProperties {
         gamma: job.original_gamma,
+        gamma_current: job.selector_gamma,
         gamma_nbr: job.original_gamma_nbr,
         relative_volume: job.relative_volume,
         kinetic_temperature: job.temperature,
@@ -201,6 +234,7 @@ fn facts_of_decision<'a>(
     let Some(found) = &decision.candidate else { return of_walk };
     StructureProperties {
         gamma: found.original_gamma,
+        gamma_current: found.selector_gamma,
         gamma_nbr: found.original_gamma_nbr,
         relative_volume: found.relative_volume,
         kinetic_temperature: found.temperature,

@@ -14,6 +14,9 @@ use crate::cli::status;
 use crate::cli::walks::{WalkSelectionArgs, WalksCommand};
 use crate::filter::StructureFilter;
 
+/// Title of the history of the campaign.
+pub const HISTORY: &str = "history of the campaign";
+
 /// The text of F1.
 pub const HELP: &str = "\
 Tab, 1 2 3       next pane; walks, queue, decisions
@@ -21,6 +24,7 @@ Tab, 1 2 3       next pane; walks, queue, decisions
 /                filter the pane, e.g. gamma > 2 and element = Mo (syntax: docs/export.md); Esc removes the filter
 Enter            history of the candidate (calmwalk explain); of a walk: its decisions
 i                output of calmwalk status --all
+h                history of the campaign since its beginning
 
 p, r             pause, resume the selected walk;  P, R  all walks
 s                view of the queue: waiting, failed, dropped, labelled
@@ -29,7 +33,8 @@ d                drop it;  t  retry it, if it failed or was dropped
 
 q                quit, or close a text; Ctrl-C quits at once
 
-γ_max of a walk is that of its last graded step; in the queue, decisions and distribution it is under the original mixture.
+γ_max is under the current mixture: of a walk, that of its last graded step; of a candidate, that at the decision. γ₀_max is under the
+original mixture: of a walk, at the last point of its trace. Filters call them gamma_current and gamma.
 Changes are recorded in the operations log, as those by commands. In reproducible mode the other walks of the same round wait for a
 paused walk.";
 
@@ -69,6 +74,10 @@ impl WatchState {
             KeyCode::Char('?') | KeyCode::F(1) => self.show("keys", HELP.to_owned()),
             KeyCode::Char('i') => {
                 self.show("calmwalk status --all", status::text(&self.snapshot, usize::MAX))
+            }
+            KeyCode::Char('h') => {
+                self.mode = InputMode::Text(TextView { title: HISTORY.to_owned(), ..TextView::default() });
+                return Some(WatchRequest::History);
             }
             KeyCode::Char('/') => {
                 let text = self.pane().filter.as_ref().map_or(String::new(), ToString::to_string);

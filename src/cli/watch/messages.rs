@@ -58,6 +58,8 @@ pub enum WatchRequest {
     Refresh,
     /// Read the history of a candidate.
     Explain(String),
+    /// Read the history of the campaign.
+    History,
     /// Change label jobs.
     Queue(QueueCommand),
     /// Pause or resume walks.
@@ -67,8 +69,8 @@ pub enum WatchRequest {
 /// The result of a request, as text.
 #[derive(Debug, PartialEq)]
 pub enum Completed {
-    /// The id of a candidate, and its history or an error.
-    Explain(String, Result<String, String>),
+    /// The title of a text, such as the id of a candidate, and the text or an error.
+    Text(String, Result<String, String>),
     /// What was changed, or an error.
     Change(Result<String, String>),
 }

@@ -15,19 +15,22 @@ mod tests;
 use std::io::{self, IsTerminal};
 use std::thread;
 
+use monitor::history::CampaignHistory;
 use ratatui::crossterm::event::{self, Event};
-use store::Location;
+use store::{Location, Store, unix_milliseconds};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
 use self::draw::Theme;
+use self::keys::HISTORY;
 use self::messages::{Completed, JobView, WatchRequest};
 use self::reader::{CampaignReader, Poller};
 use self::screen::Screen;
 use self::state::WatchState;
 use super::{CampaignArgs, CommandError, ExitStatus, block_on, duration_between, explain, queue, walks};
 use crate::duration::Duration;
+use crate::wording;
 
 /// Monitor and control a campaign in the terminal
 ///
@@ -108,7 +111,10 @@ async fn perform(location: Location, request: WatchRequest) -> Completed {
     match request {
         WatchRequest::Explain(id) => {
             let history = explain::text(location, &id).await.map_err(message);
-            Completed::Explain(id, history)
+            Completed::Text(id, history)
+        }
+        WatchRequest::History => {
+            Completed::Text(HISTORY.to_owned(), history(&location).await.map_err(message))
         }
         WatchRequest::Queue(action) => {
             let mut changed = Vec::new();
@@ -122,6 +128,14 @@ async fn perform(location: Location, request: WatchRequest) -> Completed {
         }
         WatchRequest::Quit(_) | WatchRequest::Refresh => Completed::Change(Ok(String::new())),
     }
+}
+
+/// The history of the campaign as text.
+async fn history(location: &Location) -> Result<String, CommandError> {
+    let store = Store::open_read_only(location).await?;
+    let history = CampaignHistory::read(&store, unix_milliseconds()).await?;
+    store.close().await;
+    Ok(wording::history::text(&history))
 }
 
 /// Events of the terminal, read by a thread that ends with the process.

@@ -140,7 +140,7 @@ impl WatchState {
     /// Applies the result of a request.
     pub fn complete(&mut self, completed: Completed) {
         match completed {
-            Completed::Explain(id, history) => {
+            Completed::Text(id, history) => {
                 if let InputMode::Text(text) = &mut self.mode
                     && text.text.is_none()
                     && text.title == id
@@ -166,8 +166,9 @@ impl WatchState {
         let [of_walks, of_queue, of_decisions] = &mut self.panes;
         of_walks
             .set_entries(entries::walk_entries(walks, *run_active, of_walks.filter.as_ref()), walks.len());
-        of_queue
-            .set_entries(entries::job_entries(&self.jobs, walks, of_queue.filter.as_ref()), self.jobs.len());
+        let running = &self.snapshot.labels.running;
+        let jobs = entries::job_entries(&self.jobs, walks, running, of_queue.filter.as_ref());
+        of_queue.set_entries(jobs, self.jobs.len());
         let decisions = entries::decision_entries(self.decisions.iter(), walks, of_decisions.filter.as_ref());
         of_decisions.set_entries(decisions, self.decisions.len());
         let version = |walk: &store::WalkStatus| walk.conditions.as_ref().map_or(0, |found| found.version);

@@ -28,6 +28,7 @@ fn job(number: i64, state: JobState) -> QueueEntry {
         failures: 0,
         atoms: 54,
         formula: if number % 2 == 0 { "CMo53" } else { "Mo54" }.into(),
+        selector_gamma: Some(1.0 + number as f64 / 20.0),
         original_gamma: Some(1.0 + number as f64 / 10.0),
         original_gamma_nbr: None,
         origin: "biased".into(),
@@ -122,11 +123,11 @@ fn all_panes_fit_a_small_terminal() {
         "1 walks: 1000",
         "2 queue: 3",
         "3 decisions: 100",
-        "a-long-name-o…",
-        "3.0.1-0123456789abcdef",
+        "a-lon",
+        "3.0.1-01234567 ",
         "accepted",
         "declined: covered",
-        "γ_max of 100: median 1.51, max 2.0",
+        "γ₀_max of 100: median 1.51, max 2.0",
         "accepted: 25 % of the last 100",
         "expected within 30 h",
         "training version 4: epoch 12 of 50; version 3 in force",
@@ -261,9 +262,9 @@ fn a_history_is_shown_if_its_text_view_is_still_open() {
     let id = job(2, JobState::Queued).candidate;
     assert_eq!(press(&mut state, "2 Down Enter"), Some(WatchRequest::Explain(id.clone())));
     assert!(screen(&mut state, 80, 24).contains("reading …"));
-    state.complete(Completed::Explain("another".into(), Ok("wrong".into())));
+    state.complete(Completed::Text("another".into(), Ok("wrong".into())));
     let lines: Vec<_> = (1..=50).map(|k| format!("line {k}.")).collect();
-    state.complete(Completed::Explain(id.clone(), Ok(lines.join("\n"))));
+    state.complete(Completed::Text(id.clone(), Ok(lines.join("\n"))));
     let text = screen(&mut state, 80, 24);
     assert!(text.contains("line 1.") && text.contains(&id) && text.contains("lines 1 to 21 of 50"), "{text}");
     press(&mut state, "End");
@@ -272,7 +273,7 @@ fn a_history_is_shown_if_its_text_view_is_still_open() {
     press(&mut state, "k");
     assert!(screen(&mut state, 80, 24).contains("line 29."), "one line up from the end");
     press(&mut state, "q");
-    state.complete(Completed::Explain(id, Ok("late".into())));
+    state.complete(Completed::Text(id, Ok("late".into())));
     assert!(matches!(state.mode, InputMode::Panes));
     assert_eq!(press(&mut state, "q"), Some(WatchRequest::Quit(ExitStatus::Done)));
 }

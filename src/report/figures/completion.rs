@@ -22,7 +22,7 @@ pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
         Csv::new(&["panel", "above", "up_to", "labelled", "failed", "share", "share_low", "share_high"]);
     let places = row(2, [46.0, 56.0, 12.0], 22.0, 112.0);
     for ((letter, title, bins), place) in
-        [('a', "γ_{max}", by_gamma), ('b', "V / V_{0}", by_expansion)].into_iter().zip(places)
+        [('a', "γ_{0,max}", by_gamma), ('b', "V / V_{0}", by_expansion)].into_iter().zip(places)
     {
         draw_bins(&mut figure, &mut numbers, (letter, title), &bins, place);
     }

@@ -9,6 +9,7 @@ use super::super::style::{WIDTH, axis, grouped};
 use super::super::{Csv, FigureContent, csv};
 use super::row;
 use crate::output::four_digits;
+use crate::wording::cost::core_time;
 
 /// Bins of the histogram.
 const BINS: usize = 24;
@@ -66,10 +67,10 @@ fn caption(data: &ReportData, mut seconds: Vec<f64>) -> String {
     let of = |share| quantile(&seconds, share).map_or(String::new(), |x| four_digits(x, 3));
     format!(
         "Core-seconds of successful label attempts (n = {}): median {}, 90 % quantile {}. a, Distribution. b, By size. Failed attempts \
-         are not shown; all attempts together took {} core-hours.",
+         are not shown; all attempts together took {}.",
         grouped(seconds.len() as u64),
         of(0.5),
         of(0.9),
-        four_digits(data.status.budget.used.core_hours, 4)
+        core_time(data.status.budget.used.core_hours)
     )
 }

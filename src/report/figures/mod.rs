@@ -7,6 +7,7 @@ mod cost;
 mod distributions;
 mod errors;
 mod grades;
+mod history;
 mod pairs;
 mod projection;
 mod space;
@@ -35,6 +36,7 @@ pub fn all(data: &ReportData) -> Vec<FigureEntry> {
         part("features", "Feature space", projection::draw(&data.collections)),
         part("grades", "Force errors by grade", grades::draw(&data.collections)),
         part("error-bounds", "Bounds of the force error", calibration::draw(data)),
+        part("history", "The campaign over time", history::draw(data)),
         part("cost", "Cost of labels", cost::draw(data)),
         part("completion", "Labelled share of structures", completion::draw(data)),
     ];

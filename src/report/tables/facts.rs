@@ -13,7 +13,6 @@ use super::super::report_data::ReportData;
 use super::super::style::grouped;
 use super::settings::flatten;
 use super::{PageTable, text};
-use crate::output::four_digits;
 use crate::wording;
 
 /// Elements in the summary, those first whose training data are forgotten most.
@@ -48,7 +47,7 @@ pub fn summary(data: &ReportData) -> PageTable {
         );
     }
     row("imported structures", grouped(status.imported));
-    row("cost of labels", format!("{} core-hours", four_digits(status.budget.used.core_hours, 4)));
+    row("cost of labels", wording::cost::core_time(status.budget.used.core_hours));
     let training = data.values.get(TRAINING_FRAMES);
     row("mixture", mixture(status.mixture_version, training));
     let forgotten = training.map(forgetting_by_element).unwrap_or_default();

@@ -1,5 +1,6 @@
 //! Versions of the potential, their errors, and how well their grades predicted them.
 
+use atoms::units::GPA_PER_EV_A3;
 use monitor::label_statistics::{LARGE_FORCE_ERROR, LabelStatistics};
 use monitor::versions::{CampaignVersions, VersionSetErrors};
 
@@ -47,7 +48,7 @@ pub fn errors(found: &CampaignVersions) -> PageTable {
         "energy MAE (eV/atom)",
         "force MAE (eV Å^{−1})",
         "force RMSE (eV Å^{−1})",
-        "stress MAE (eV Å^{−3})",
+        "stress MAE (GPa)",
         "change from parent (%)",
         "change from version 0 (%)",
     ];
@@ -65,7 +66,7 @@ pub fn errors(found: &CampaignVersions) -> PageTable {
                 real(errors.and_then(|errors| errors.energy_mae), 5),
                 real(errors.and_then(|errors| errors.force_mae), 4),
                 real(errors.and_then(|errors| errors.force_rmse), 4),
-                real(errors.and_then(|errors| errors.stress_mae), 6),
+                real(errors.and_then(|errors| errors.stress_mae).map(|mae| GPA_PER_EV_A3 * mae), 4),
                 percent(set.change_from_parent()),
                 percent(set.change_since_first()),
             ]);

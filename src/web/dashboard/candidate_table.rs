@@ -205,6 +205,7 @@ fn properties<'a>(
 ) -> StructureProperties<'a> {
     StructureProperties {
         gamma: row.gamma,
+        gamma_current: row.selector_gamma,
         gamma_nbr: row.gamma_nbr,
         relative_volume: row.relative_volume,
         kinetic_temperature: row.temperature,

@@ -5,6 +5,7 @@ mod cache;
 mod candidate;
 mod candidate_table;
 mod force_errors;
+mod history;
 mod mixture;
 mod response;
 mod sse;
@@ -57,6 +58,7 @@ impl Dashboard {
             .route("/pages/{name}", get(static_files::file))
             .route("/api/events", get(sse::events))
             .route("/api/samples", get(sse::samples))
+            .route("/api/history", get(history::history))
             .route("/api/candidates", get(candidate_table::page))
             .route("/api/candidates/{id}", get(candidate::details))
             .route("/api/candidates/{id}/structure", get(candidate::structure))

@@ -27,6 +27,7 @@ const FILES: &[(&str, &str)] = files![
     "dom.js",
     "errors.js",
     "format.js",
+    "history.js",
     "hosts.js",
     "icon.svg",
     "main.js",

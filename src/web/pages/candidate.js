@@ -4,7 +4,7 @@ import { buttons } from "./actions.js";
 import { candidatePath, fetchJson } from "./api.js";
 import { DASHES, LINES } from "./colours.js";
 import { element, facts, section, state, table, words } from "./dom.js";
-import { decimals, digits, duration, labelValue, percent, shortName, time, whole } from "./format.js";
+import { coreTime, counted, decimals, digits, duration, labelValue, percent, shortName, time, whole } from "./format.js";
 import { plot } from "./plot.js";
 import { view } from "./structure.js";
 
@@ -72,10 +72,10 @@ function downloads({ id }) {
 function graded(grades) {
   const columns = [["mixture"], ["version", true], ["γ_max", true], ["γ_nbr, largest", true], ["atoms with γ > 1", true]];
   const row = (name, grade) => [name, whole(grade.mixture_version), decimals(grade.gamma_max, 3), decimals(grade.gamma_nbr_max, 3), whole(grade.atoms_above_1)];
-  const rows = [row("walker", grades.walker), row("selector, at the decision", grades.selector), row("original", grades.original)];
+  const rows = [row("walker", grades.walker), row("selector, at the decision", grades.selector), row("original (γ₀)", grades.original)];
   const { trigger } = grades;
   return element("div", {}, table("Grades under three mixtures", columns, rows), facts([
-    ["staleness", `the walker's mixture was ${whole(grades.staleness)} versions behind`],
+    ["staleness", grades.staleness > 0 ? `the walker's mixture was ${counted(grades.staleness, "version")} behind` : null],
     ["collection rule", trigger && `requires ${trigger.needed} atoms with γ > ${digits(trigger.threshold)}; there were ` +
       `${trigger.above_walker} under the walker's mixture, ${trigger.above_selector} under the selector's`],
   ]));
@@ -107,11 +107,11 @@ function trace(found, grades, signal) {
   const draw = (offered) => {
     const before = offered.filter((one) => one.segment === found.segment && one.step <= found.step);
     const points = (key) => before.filter((one) => one[key] != null).map((one) => [one.step, one[key]]);
-    const marks = (key, shape, k) => ({ name: key === "gamma" ? "original mixture" : "the walker's mixture", shape, colour: LINES[k],
+    const marks = (key, shape, k) => ({ name: key === "gamma" ? "γ₀_max, original mixture" : "γ_max, the walker's mixture", shape, colour: LINES[k],
       points: before.filter((one) => one[key] != null).map((one) => [one.step, one[key], `#candidate/${encodeURIComponent(one.id)}`,
         `step ${one.step}: ${words(one.fate)}`]) });
     place.replaceChildren(plot({ title: `Walk ${found.walk}, segment ${found.segment}: earlier candidates`,
-      x: { title: "step" }, y: { title: "γ_max", least: 0 },
+      x: { title: "step" }, y: { title: "γ_max, γ₀_max", least: 0 },
       lines: [{ colour: LINES[0], points: points("gamma") }, { colour: LINES[1], dash: DASHES[1], points: points("walker_gamma") }],
       marks: [marks("gamma", "circle", 0), marks("walker_gamma", "diamond", 1)] }));
   };
@@ -149,7 +149,7 @@ function job(found) {
     ["value", found.value == null ? null : valueWithFactors(found)],
     ["excluded", found.excluded && `its label is excluded from exports and statistics: ${found.excluded}`],
     ["leased by", holder && `${holder}, until ${time(found.expires)}`],
-    ["cost", found.core_seconds == null ? null : digits(found.core_seconds, "core-seconds")],
+    ["cost", found.core_seconds == null ? null : coreTime(found.core_seconds / 3600)],
     ["manual actions", manual.map((done) => `${done.action}${done.priority == null ? "" : ` ${done.priority}`}${done.reason ? ` (${done.reason})` : ""}, ${time(done.time)}`).join("; ")],
   ]), attempts.map(attempt));
 }
@@ -159,7 +159,8 @@ function attempt(made) {
   const lasted = made.ended == null ? `since ${time(made.started)}` : `after ${duration(made.ended - made.started)}`;
   const failed = made.class ? ` (${words(made.class)})` : "";
   const line = `attempt ${made.attempt}: ${how}${failed} ${lasted}, by ${made.holder}`;
-  const more = [made.calculation && `calculation ${made.calculation}`, made.remedies && `retry adjustments: ${made.remedies}`, made.difference, made.log]
+  const more = [made.calculation && `calculation ${made.calculation}`, made.remedies && `retry adjustments: ${made.remedies}`, made.difference,
+    ["labelled", "check"].includes(made.outcome) ? null : made.log]
     .filter(Boolean).join("\n");
   return more ? element("details", { class: "attempt" }, element("summary", {}, line), element("pre", { tabindex: "0" }, more))
     : element("p", { class: "attempt" }, line);
@@ -187,7 +188,7 @@ function label(made) {
     ["magnetisation", made.details.magnetisation == null ? null : decimals(made.details.magnetisation, 4, "μ_B")],
     ["energy", `${decimals(made.energy, 6, "eV")} (${decimals(made.energy_per_atom, 6, "eV")} per atom)`],
     ["largest force", decimals(made.max_force, 4, "eV/Å")],
-    ["pressure", made.pressure == null ? null : digits(made.pressure, "eV/Å³")],
+    ["pressure", made.pressure == null ? null : digits(160.2176634 * made.pressure, "GPa")],
     ["energy error of the potential", model && energyError(model)],
     ["force errors of the potential", model && `mean ${decimals(model.mean, 4)}, largest ${decimals(model.largest, 4, "eV/Å")} (atom ${model.atom})`],
   ]);

@@ -10,8 +10,8 @@ export const TITLE = "Candidates";
 const LENGTH = 50;
 const STATES = ["queued", "leased", "labelled", "failed", "dropped", "superseded"];
 /** Columns: title, whether it is numeric, and the sort order of its title. */
-const COLUMNS = [["candidate"], ["decision", true, "decision"], ["fate"], ["label"], ["priority", true, "queue"], ["value", true], ["γ_max", true, "gamma"],
-  ["γ_nbr", true], ["V/V₀", true, "relative_volume"], ["T", true], ["seed structure"], ["formula"], ["atoms", true], ["attempts", true]];
+const COLUMNS = [["candidate"], ["decision", true, "decision"], ["fate"], ["label"], ["priority", true, "queue"], ["value", true], ["γ_max", true], ["γ₀_max", true, "gamma"],
+  ["γ₀_nbr", true], ["V/V₀", true, "relative_volume"], ["T", true], ["seed structure"], ["formula"], ["atoms", true], ["attempts", true]];
 
 export function show(content, rest, signal) {
   // The query is part of the address, so that it can be bookmarked and shared.
@@ -78,7 +78,7 @@ function filters(params, change) {
   return element("form", { class: "filters", role: "search", onsubmit: submit }, choice("fate", "fate", Object.keys(FATES)),
     choice("label", "state", STATES), element("label", {}, "where", where), element("button", {}, "Show"),
     element("details", {}, element("summary", {}, "Syntax"), element("p", {},
-      "gamma, gamma_nbr (original mixture), relative_volume (V/V₀), kinetic_temperature (K), temperature, tau, version (of the potential) and group of its walk, walk, step, mixture_version (after the decision), atoms, " +
+      "gamma (γ₀_max), gamma_nbr (γ₀_nbr; both under the original mixture), gamma_current (γ_max at the decision), relative_volume (V/V₀), kinetic_temperature (K), temperature, tau, version (of the potential) and group of its walk, walk, step, mixture_version (after the decision), atoms, " +
       "energy (eV), energy_per_atom and max_force (eV/Å) of the label, with = != < <= > >=; " +
       "element, origin (biased or control), seed_structure, retry_adjustment with = and !=; and, or, not and parentheses. " +
       "A comparison with a missing value, such as the energy of an unlabelled candidate, is false.")));
@@ -122,7 +122,8 @@ function line(candidate, columns) {
   const cells = [
     element("a", { href: `#candidate/${encodeURIComponent(candidate.id)}`, title: candidate.id }, shortName(candidate.id)),
     whole(candidate.decision), state(fate), candidate.job_state ? state(candidate.job_state) : "–",
-    candidate.priority ?? "–", labelValue(candidate.value), decimals(candidate.gamma, 2), decimals(candidate.gamma_nbr, 2),
+    candidate.priority ?? "–", labelValue(candidate.value), decimals(candidate.selector_gamma, 2), decimals(candidate.gamma, 2),
+    decimals(candidate.gamma_nbr, 2),
     decimals(candidate.relative_volume, 4), decimals(candidate.temperature, 0, "K"), candidate.seed_structure, candidate.formula,
     whole(candidate.atoms), candidate.attempts ?? "–", whole(candidate.version)];
   return element("tr", {}, columns.map(([, isNumber], k) => element("td", { class: isNumber && "number" }, cells[k])));

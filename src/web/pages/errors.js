@@ -43,7 +43,7 @@ function shown(errors) {
     comparison(errors),
     section("By γ", quantiles("γ", all.gamma, errors.large)), section("By γ_nbr", quantiles("γ_nbr", all.gamma_nbr, errors.large)),
     section("Bounds of the force error", ...errorBounds(errors.calibration)),
-    section("Structures without a label", completion("γ_max", errors.completion_by_gamma), completion("V/V₀", errors.completion_by_relative_volume)),
+    section("Structures without a label", completion("γ₀_max", errors.completion_by_gamma), completion("V/V₀", errors.completion_by_relative_volume)),
   ];
 }
 

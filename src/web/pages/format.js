@@ -23,6 +23,16 @@ export function digits(value, unit = "") {
   return decimals(value, size >= 100 ? 0 : size >= 10 ? 1 : size >= 1 ? 2 : 3, unit);
 }
 
+/** A cost in core-hours, below one in core-seconds. */
+export function coreTime(hours) {
+  return hours != null && hours < 1 ? digits(3600 * hours, "core-seconds") : digits(hours, "core-hours");
+}
+
+/** A number with its noun. */
+export function counted(number, noun) {
+  return `${whole(number)} ${noun}${number === 1 ? "" : "s"}`;
+}
+
 /** The value of a queued label. One that is next for its age has the largest number. */
 export function labelValue(value) {
   return value > 1e300 ? "next" : digits(value);

@@ -3,12 +3,16 @@
 import { canPause, pauseButton } from "./actions.js";
 import { listen } from "./api.js";
 import { element, facts, renew, section, sentence, state, table, words } from "./dom.js";
-import { bytes, decimals, digits, duration, percent, time, whole } from "./format.js";
+import { bytes, coreTime, counted, decimals, digits, duration, percent, shortName, time, whole } from "./format.js";
+import { overHistory } from "./history.js";
 import { overTime } from "./plots.js";
 import { campaignState } from "./campaign_state.js";
 import { versions } from "./versions.js";
 
 export const TITLE = "Overview";
+
+/** Largest number of labels under way shown. */
+const LABELS = 10;
 
 /** Largest number of walks shown; running ones come first. */
 const WALKS = 40;
@@ -17,13 +21,15 @@ const WALKS = 40;
 const ELEMENTS = 4;
 
 const WALK_COLUMNS = [["walk", true], ["seed structure"], ["origin"], ["state"], ["step", true], ["T", true], ["V/V₀", true],
-  ["γ_max", true], ["τ", true], ["steps/s", true], ["accepted", true], ["rejected", true]];
+  ["γ_max", true], ["γ₀_max", true], ["τ", true], ["steps/s", true], ["accepted", true], ["rejected", true]];
 
 export function show(content, _, signal) {
   const tiles = element("div", { class: "tiles" });
+  const history = element("div", { class: "plots" });
   const plots = element("div", { class: "plots" });
   const rest = element("div");
-  content.append(tiles, section("Since the dashboard started", plots), rest);
+  content.append(tiles, section("History", history, plots), rest);
+  overHistory(history, signal);
   overTime(plots, signal);
   let [status, changes] = [null, false];
   const draw = () => {
@@ -60,18 +66,18 @@ function summary(status) {
   return [
     tile("Campaign", state(how), `${status.campaign.slice(0, 8)}, ${status.mode} mode`,
       status.round > 0 ? `round ${whole(status.round)}` : "", `${bytes(status.disk.bytes)} on disk`),
-    tile("Walks", `${whole(underWay)} ${status.run_active ? "running" : "unfinished"}`, ended(status.ends, walks.length - underWay),
+    tile("Walks", underWay > 0 || walks.length === 0 ? `${whole(underWay)} ${status.run_active ? "running" : "unfinished"}` : `${whole(walks.length)} ended`,
+      underWay > 0 || hasEarlyEnds(status.ends) ? ended(status.ends, walks.length - underWay) : "",
       status.steps_per_second == null ? "" : `${digits(status.steps_per_second)} steps/s in all`),
     tile("Candidates", `${whole(candidates.accepted)} accepted`,
       `of ${whole(candidates.seen)} seen (${percent(share(candidates.accepted, candidates.seen))})`,
-      declined && `declined: ${declined}`, `${whole(candidates.control)} control frames`,
+      declined && `declined: ${declined}`, candidates.control > 0 && counted(candidates.control, "control frame"),
       candidates.left_out > 0 && `${whole(candidates.left_out)} left out (could not be graded, or control frames with atoms too close)`,
       status.shared_structures > 0 && `${whole(status.shared_structures)} of them identical to structures of their biased walks`),
-    tile("Labels", `${whole(labels.labelled)} made`, `${whole(labels.queued)} queued, ${whole(labels.leased)} leased`,
-      `${whole(labels.failed)} failed, ${whole(labels.dropped)} dropped${labels.superseded > 0 ? `, ${whole(labels.superseded)} superseded` : ""}${
-        labels.excluded > 0 ? `, ${whole(labels.excluded)} excluded` : ""}`,
+    tile("Labels", `${whole(labels.labelled)} made`, ["queued", "leased", "failed", "dropped", "superseded", "excluded"].filter((name) => labels[name] > 0)
+      .map((name) => `${whole(labels[name])} ${name}`).join(", "),
       labels.lower_states > 0 && `lower states known of ${whole(labels.lower_states)} structures (calmwalk lower-states)`,
-      `${whole(status.labels_last_hour)} made in the last hour`),
+      status.labels_last_hour > 0 && `${whole(status.labels_last_hour)} made in the last hour`),
     (inForce || status.refit) && tile("Potential", `version ${whole(inForce?.number ?? 0)}`,
       inForce?.number > 0 && `trained on ${whole(inForce.labels)} labels`,
       status.refit && `training version ${whole(status.refit.number)}: ${status.refit.remark || words(status.refit.state)}`),
@@ -110,6 +116,10 @@ function exceeded({ level_of_share: share, level_of_growth: growth }) {
   return [share > 1 && "calm.forgetting_alarm", growth > 1 && "calm.max_mean_square_growth"].filter(Boolean).join(" and ") || "the limit";
 }
 
+function hasEarlyEnds(ends) {
+  return ends.some((end) => end.cause != null);
+}
+
 /** Number of ended walks, with early ends. */
 function ended(ends, number) {
   const early = ends.filter((end) => end.cause != null).reduce((sum, end) => sum + end.walks, 0);
@@ -134,13 +144,27 @@ function queue(status) {
   const list = facts([
     ["labels per hour", status.labels_per_hour == null ? null : digits(status.labels_per_hour, "/h")],
     ["oldest lease", oldest && `job ${oldest.job}, for ${duration(Date.now() - oldest.started)}, by ${oldest.holder}`],
-    ["cost so far", digits(cost.core_hours, "core-hours")],
-    ["cost of the queue", remaining && `${digits(remaining.expected)} (${digits(remaining.low)} to ${digits(remaining.high)}) core-hours`],
+    ["cost so far", coreTime(cost.core_hours)],
+    ["cost of the queue", remaining && `${coreTime(remaining.expected)} (${coreTime(remaining.low)} to ${coreTime(remaining.high)})`],
   ]);
-  if (failures.length === 0) return list;
+  const making = inProgress(status.labels_in_progress);
+  if (failures.length === 0) return element("div", {}, list, making);
   const columns = [["class of failure"], ["failed", true], ["labelled later", true], ["unfinished", true]];
   const rows = failures.map((failure) => [words(failure.class), whole(failure.failed), whole(failure.labelled), whole(failure.unfinished)]);
-  return element("div", {}, list, table("Label failures by class", columns, rows));
+  return element("div", {}, list, making, table("Label failures by class", columns, rows));
+}
+
+/** Labels that are being made, the longest first. */
+function inProgress(labels) {
+  if (labels.length === 0) return "";
+  const columns = [["candidate"], ["formula"], ["protocol"], ["attempt", true], ["time so far", true], ["expected end", true], ["labeller"]];
+  return table("Labels under way", columns, labels.slice(0, LABELS).map((one) => {
+    const name = one.candidate.startsWith("import-") ? one.candidate
+      : element("a", { href: `#candidate/${encodeURIComponent(one.candidate)}`, title: one.candidate }, shortName(one.candidate));
+    const left = one.expected_seconds == null ? null : one.started + 1000 * one.expected_seconds - Date.now();
+    const end = left == null ? "unknown" : left > 0 ? `in ${duration(left)}` : "overdue";
+    return [name, one.formula, one.protocol, whole(one.attempt), duration(Date.now() - one.started), end, one.holder];
+  }));
 }
 
 function budget(status) {
@@ -177,6 +201,7 @@ function walks({ walks: all, run_active }, changed) {
   const rows = order.slice(0, WALKS).map((walk) => [
     element("a", { href: `#walk/${walk.walk}`, "data-keep": `walk-${walk.walk}` }, whole(walk.walk)), walk.seed_structure, walk.origin, sentence(state(stateOf(walk, run_active)), walk.reason && ` ${walk.reason}`),
     whole(walk.reference_step ?? walk.step), decimals(walk.temperature, 0, "K"), decimals(walk.relative_volume, 4), decimals(walk.gamma_max, 2),
+    decimals(walk.gamma_max_original, 2),
     digits(walk.tau), digits(walk.steps_per_second), whole(walk.accepted), whole(walk.rejected), ...(changed ? [button(walk) || ""] : [])]);
   const more = all.length - rows.length;
   const [going, paused] = [all.filter((walk) => isUnderWay(walk) && !walk.paused), all.filter((walk) => walk.paused)];

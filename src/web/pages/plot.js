@@ -13,7 +13,7 @@ const SHAPES = {
 const HOLLOW = new Set(["cross", "plus", "ring"]);
 
 /**
- * A plot: `title`, `x` and `y` (axes: title; `ticks` formats a number; `min_atoms`, `most`: values to include; `logarithmic`), and
+ * A plot: `title`, `x` and `y` (axes: title; `ticks` formats a number; `steps`: distances of ticks; `min_atoms`, `most`: values to include; `logarithmic`), and
  * `lines` ({name, colour, dash, points: [[x, y], …]}), `bands` ({colour, points: [[x, low, high], …]}) and `marks` ({name, colour, shape,
  * points: [[x, y, href, text], …]}). A y of null breaks a line.
  */
@@ -56,7 +56,7 @@ function mark({ colour, shape }, [x, y, href, text], across, up) {
 }
 
 /** Maps numbers to positions between `from` and `to`, with round ticks. */
-function axis({ least, most, logarithmic, ticks = tick }, values, from, to) {
+function axis({ least, most, logarithmic, steps, ticks = tick }, values, from, to) {
   let low = values.reduce((a, b) => Math.min(a, b), least ?? Infinity);
   let high = values.reduce((a, b) => Math.max(a, b), most ?? -Infinity);
   if (logarithmic) [low, high] = [Math.log10(Math.max(low, 1e-12)), Math.log10(Math.max(high, 1e-12))];
@@ -65,8 +65,8 @@ function axis({ least, most, logarithmic, ticks = tick }, values, from, to) {
     const place = logarithmic ? Math.log10(Math.max(value, 1e-12)) : value;
     return from + ((place - low) / (high - low)) * (to - from);
   };
-  const number = Math.abs(to - from) / 55;
-  return { at, ticks: logarithmic ? roundPowers(low, high) : roundNumbers(low, high, number), text: ticks };
+  const number = Math.abs(to - from) / (steps ? 70 : 55);
+  return { at, ticks: logarithmic ? roundPowers(low, high) : roundNumbers(low, high, number, steps), text: ticks };
 }
 
 /** Range around a single value. It keeps the sign, and starts at 0 for a value of 0. */
@@ -76,10 +76,11 @@ function around(value, logarithmic) {
   return value === 0 ? [0, 1] : [value - part, value + part];
 }
 
-function roundNumbers(low, high, number) {
+/** `steps`: the distances to choose from. */
+function roundNumbers(low, high, number, steps) {
   const rough = (high - low) / Math.max(number, 2);
   const power = 10 ** Math.floor(Math.log10(rough));
-  const step = [1, 2, 5, 10].map((factor) => factor * power).find((candidate) => candidate >= rough);
+  const step = (steps ?? [1, 2, 5, 10].map((factor) => factor * power)).find((candidate) => candidate >= rough) ?? rough;
   const first = Math.ceil(low / step);
   return Array.from({ length: Math.floor(high / step + 1e-9) - first + 1 }, (_, k) => (first + k) * step);
 }

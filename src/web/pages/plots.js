@@ -1,9 +1,9 @@
-// The plots of the overview: over time since the dashboard started, and of the newest candidates.
+// Two plots of the overview: the grades of walks since the dashboard started, and the newest candidates.
 
 import { fetchJson, listen } from "./api.js";
 import { DASHES, FATES, LINES } from "./colours.js";
 import { words } from "./dom.js";
-import { shortName, tick, whole } from "./format.js";
+import { shortName, tick } from "./format.js";
 import { plot } from "./plot.js";
 
 /** Largest number of samples kept by this page. */
@@ -33,28 +33,14 @@ export function overTime(place, signal) {
 
 function drawn(samples) {
   const last = samples.at(-1).time;
-  // All plots share one time axis.
   const x = axisOfTime(last - samples[0].time);
   const at = (sample) => (sample.time - last) / x.unit;
   const line = (read) => samples.map((sample) => [at(sample), read(sample)]);
-  const rate = (from, scale) => samples.map((sample, k) => {
-    const before = samples[Math.max(0, k - Math.max(5, Math.floor(samples.length / 20)))];
-    return [at(sample), sample === before ? null : scale(from(sample) - from(before), sample, before)];
-  });
   const walks = [...new Set(samples.flatMap((sample) => Object.keys(sample.gamma)))].slice(-LINES.length * DASHES.length);
   return [
-    plot({ title: "Grade of walks", x, y: { title: "γ_max", least: 0, most: 1 }, lines: walks.map((walk, k) => ({
+    plot({ title: "Grade of walks since the dashboard started", x, y: { title: "γ_max", least: 0, most: 1 }, lines: walks.map((walk, k) => ({
       name: `walk ${walk}`, colour: LINES[k % LINES.length], dash: DASHES[Math.floor(k / LINES.length) % DASHES.length],
       points: line((sample) => sample.gamma[walk]) })) }),
-    plot({ title: "Acceptance", x, y: { title: "accepted of seen (%)", least: 0, most: 100 }, lines: [{
-      colour: LINES[0], points: rate((sample) => sample.accepted, (accepted, now, then) =>
-        (now.seen > then.seen ? (100 * accepted) / (now.seen - then.seen) : null)) }] }),
-    plot({ title: "Label rate", x, y: { title: "labels per hour (1/h)", least: 0, most: 1 }, lines: [{
-      colour: LINES[2], points: rate((sample) => sample.labels, (labels, now, then) =>
-        (3.6e6 * labels) / (now.time - then.time)) }] }),
-    plot({ title: "Label queue", x, y: { title: "jobs", least: 0, most: 4, ticks: whole }, lines: [
-      { name: "queued", colour: LINES[0], points: line((sample) => sample.queued) },
-      { name: "leased", colour: LINES[1], dash: DASHES[1], points: line((sample) => sample.leased) }] }),
   ];
 }
 
@@ -75,5 +61,5 @@ function newestCandidates(newest) {
   const marks = Object.entries(FATES).map(([name, look]) => ({ name: words(name), ...look,
     points: newest.filter((one) => fate(one) === name && one.gamma != null && one.relative_volume != null).map(point) }));
   return plot({ title: `Grade and volume of the newest ${NEWEST} candidates`, x: { title: "V/V₀" },
-    y: { title: "γ_max (original mixture)", least: 0 }, marks: marks.filter((kind) => kind.points.length > 0) });
+    y: { title: "γ₀_max", least: 0 }, marks: marks.filter((kind) => kind.points.length > 0) });
 }

@@ -10,7 +10,7 @@ const RADIUS = 1.05;
 const TURN = Math.PI / 24;
 
 /** Quantities to colour atoms by. */
-const BY = { gamma_original: "γ, original mixture", gamma_walker: "γ, the walker's mixture", gamma_nbr_original: "γ_nbr, original mixture", error: "force error (eV/Å)" };
+const BY = { gamma_original: "γ₀, original mixture", gamma_walker: "γ, the walker's mixture", gamma_nbr_original: "γ₀_nbr, original mixture", error: "force error (eV/Å)" };
 
 /** The view with its table. `grades` may be missing. */
 export function view(found, grades, labels) {

@@ -8,7 +8,7 @@ import { plot } from "./plot.js";
 const COLUMNS = [["version", true], ["state"], ["trained from", true], ["labels", true], ["accepted", true], ["labelled", true],
   ["wall time", true], ["core-hours", true], ["since"], ["refused because"]];
 const ERRORS = [["version", true], ["set"], ["structures", true], ["energy MAE (meV/atom)", true], ["force MAE (eV/Å)", true],
-  ["force RMSE (eV/Å)", true], ["stress MAE (eV/Å³)", true], ["from parent (%)", true], ["from version 0 (%)", true]];
+  ["force RMSE (eV/Å)", true], ["stress MAE (GPa)", true], ["from parent (%)", true], ["from version 0 (%)", true]];
 
 /** A section about the versions; nothing in a campaign that has never trained one. */
 export function versions({ versions: all }) {
@@ -27,7 +27,7 @@ function errors(all) {
   const rows = all.flatMap((one) => one.errors.map((set) => {
     const { energy_mae: energy, force_mae: force, force_rmse: rmse, stress_mae: stress } = set.version ?? {};
     return [whole(one.number), set.name, whole(set.structures), energy == null ? null : decimals(1000 * energy, 1), decimals(force, 4),
-      decimals(rmse, 4), digits(stress), change(set.parent?.force_mae, force), change(set.first?.force_mae, force)];
+      decimals(rmse, 4), digits(stress == null ? null : 160.2176634 * stress), change(set.parent?.force_mae, force), change(set.first?.force_mae, force)];
   }));
   return table("Errors by version and data set", ERRORS, rows);
 }

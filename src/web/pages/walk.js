@@ -85,16 +85,16 @@ function drawn({ points, threshold, origin }, candidates, inPs) {
 
 /** γ_max under the walker's mixture and under the original one, candidates under the original one, and the threshold. */
 function grade({ x, at, last, threshold, points, line, candidates }) {
-  const lines = [{ name: "the walker's mixture", colour: LINES[0], points: line((point) => point.gamma_max) }];
+  const lines = [{ name: "γ_max, the walker's mixture", colour: LINES[0], points: line((point) => point.gamma_max) }];
   // Points of earlier versions have none.
   if (points.some((point) => point.gamma_max_original != null)) {
-    lines.push({ name: "original mixture", colour: LINES[1], dash: DASHES[2], points: line((point) => point.gamma_max_original) });
+    lines.push({ name: "γ₀_max, original mixture", colour: LINES[1], dash: DASHES[2], points: line((point) => point.gamma_max_original) });
   }
   if (threshold != null) lines.push({ name: "threshold", colour: LINES[4], dash: DASHES[1], points: [[0, threshold], [at(last), threshold]] });
-  const marks = Object.entries(FATES).map(([name, look]) => ({ name: `${words(name)} (original mixture)`, ...look,
+  const marks = Object.entries(FATES).map(([name, look]) => ({ name: `${words(name)} (γ₀_max)`, ...look,
     points: candidates.filter((one) => (one.origin === "control" ? "control" : one.fate) === name && one.gamma != null)
       .map((one) => [at(one.step), one.gamma, `#candidate/${encodeURIComponent(one.id)}`, `step ${one.step}: ${words(one.fate)}`]) }));
-  return plot({ title: "Grade", x, y: { title: "γ_max", least: 0 }, lines, marks: marks.filter((kind) => kind.points.length > 0) });
+  return plot({ title: "Grade", x, y: { title: "γ_max, γ₀_max", least: 0 }, lines, marks: marks.filter((kind) => kind.points.length > 0) });
 }
 
 function lengths(points, x, line) {

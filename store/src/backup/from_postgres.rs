@@ -44,7 +44,7 @@ macro_rules! table {
 
 /// All tables except those of the leader, of processes and their progress, and of job counts, which triggers count
 /// again. Each table comes after those that it references. A new database already has some rows of `campaign`.
-const TABLES: [CopiedTable; 23] = [
+const TABLES: [CopiedTable; 24] = [
     table!("campaign" { key: T, value: T, checksum: I }),
     table!("value" { name: T, value: T, checksum: I }),
     table!("structure" { number: I, hash: B, atoms: I, formula: T, data: B, checksum: I }),
@@ -95,6 +95,10 @@ const TABLES: [CopiedTable; 23] = [
     table!("version" {
         number: I, parent: I, state: T, reason: T, method: T, structures: I, last_decision: I, labels: I,
         model_hash: T, mixture_hash: T, figures: T, seconds: R, core_hours: R, time: I, checksum: I,
+    }),
+    table!("sample" {
+        time: I, run: I, seen: I, accepted: I, queued: I, leased: I, labels: I, failed_attempts: I, failed_jobs: I,
+        core_milliseconds: I, mixture_version: I, steps_per_second: R, walkers_busy: R,
     }),
     table!("version_file" 1 { version: I, name: T, data: B }),
 ];

@@ -16,10 +16,10 @@ use crate::old_schema::{self, FIRST_WITH_CHECKSUMS, FIRST_WITH_PRESENT_WORDS};
 use crate::tables::{checksums, renamed_words};
 
 /// The newest migration.
-const SCHEMA: i64 = 21;
+const SCHEMA: i64 = 22;
 
 /// The migrations in order.
-pub(crate) static STEPS: [MigrationSource; 20] = [
+pub(crate) static STEPS: [MigrationSource; 21] = [
     (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
     (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
     (4, "counts", include_str!("../../migrations/postgres/0004_counts.sql")),
@@ -40,6 +40,7 @@ pub(crate) static STEPS: [MigrationSource; 20] = [
     (19, "walk traces", include_str!("../../migrations/postgres/0019_walk_traces.sql")),
     (20, "assignments", include_str!("../../migrations/postgres/0020_assignments.sql")),
     (21, "trajectories", include_str!("../../migrations/postgres/0021_trajectories.sql")),
+    (22, "samples", include_str!("../../migrations/postgres/0022_samples.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));

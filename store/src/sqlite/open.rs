@@ -23,14 +23,14 @@ use crate::tables::{checksums, renamed_words};
 /// `PRAGMA application_id` of a campaign: "CALM".
 pub(super) const APPLICATION: i64 = 0x4341_4c4d;
 /// `PRAGMA user_version` after the newest migration.
-pub(super) const SCHEMA: i64 = 21;
+pub(super) const SCHEMA: i64 = 22;
 /// Tries to migrate a database while other processes try the same.
 const MIGRATION_ATTEMPTS: u32 = 50;
 /// Time between two tries to open a database.
 const OPEN_RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
 /// The migrations in order.
-pub(crate) static STEPS: [MigrationSource; 21] = [
+pub(crate) static STEPS: [MigrationSource; 22] = [
     (1, "campaign", include_str!("../../migrations/sqlite/0001_campaign.sql")),
     (2, "processes", include_str!("../../migrations/sqlite/0002_processes.sql")),
     (3, "calculations", include_str!("../../migrations/sqlite/0003_calculations.sql")),
@@ -52,6 +52,7 @@ pub(crate) static STEPS: [MigrationSource; 21] = [
     (19, "walk traces", include_str!("../../migrations/sqlite/0019_walk_traces.sql")),
     (20, "assignments", include_str!("../../migrations/sqlite/0020_assignments.sql")),
     (21, "trajectories", include_str!("../../migrations/sqlite/0021_trajectories.sql")),
+    (22, "samples", include_str!("../../migrations/sqlite/0022_samples.sql")),
 ];
 
 pub(super) static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));

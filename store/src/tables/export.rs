@@ -184,6 +184,7 @@ pub(super) fn candidate(row: &SqlRow, protocol_name: &str, protocol: ContentHash
         seed_structure_name,
         origin: origin(&row.get::<String>("candidate__origin")?)?,
         mixture_version_after: row.get("decision__mixture_version")?,
+        selector_gamma: row.get("candidate__selector_gamma")?,
         original: grades(row.get::<Option<Vec<u8>>>("original_grades")?.as_deref())?,
     };
     labelled(row, ExportCursor::Candidate(row.get("decision")?), source, protocol_name, protocol)

@@ -33,6 +33,7 @@ impl FromRow for ListedCandidate {
             temperature: row.get("candidate__temperature")?,
             relative_volume: row.get("candidate__relative_volume")?,
             walker_gamma: row.get("candidate__walker_gamma")?,
+            selector_gamma: row.get("candidate__selector_gamma")?,
             gamma: row.get("candidate__original_gamma")?,
             gamma_nbr: row.get("candidate__original_gamma_nbr")?,
             job_state: row.get("job_state")?,

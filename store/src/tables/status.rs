@@ -4,7 +4,7 @@ use wire::WalkId;
 
 use super::{
     assignments, budget, exclude, job_counts, lower_states, pauses, processes, relabel, walk_conditions,
-    walk_progress,
+    walk_progress, walk_trace,
 };
 use crate::Store;
 use crate::budget::{Budget, BudgetStatus};
@@ -70,7 +70,9 @@ impl Store {
         let mut walks: Vec<WalkStatus> = query(walks!("ORDER BY walk")).fetch_all(&mut transaction).await?;
         let mut conditions = walk_conditions::read(&mut transaction).await?;
         let volumes = assignments::reference_volumes(&mut transaction).await?;
+        let original = walk_trace::last_original_grades(&mut transaction).await?;
         for walk in &mut walks {
+            walk.gamma_max_original = original.get(&walk.walk).copied();
             walk.conditions = conditions.remove(&WalkId(walk.walk));
             walk.reference_volume = volumes.get(&walk.walk).copied();
         }

@@ -8,13 +8,17 @@ use crate::Store;
 use crate::checksum::{Names, WALK_TRACE};
 use crate::database::{FromRow, SqlRow, Transaction, execute_rows, query};
 use crate::error::Result;
-use crate::walk_trace::{decode, encode};
+use crate::walk_trace::{POINT_BYTES, decode, encode};
 
 const TABLE: &str = "walk_trace";
 const COLUMNS: [&str; 4] = ["walk", "points", "data", "checksum"];
 
 const UPSERT: &str = "INSERT INTO walk_trace ({columns}) SELECT * FROM {rows} WHERE TRUE
     ON CONFLICT (walk) DO UPDATE SET {excluded}";
+
+/// The last number of each trace. The last quantity of the newest points is γ_max under the original mixture; traces of earlier versions are
+/// shorter. Reads no more of a trace than that, and so cannot verify its checksum.
+const LAST_NUMBERS: &str = "SELECT walk, substr(data, length(data) - 7, 8) AS last FROM walk_trace WHERE length(data) = 8 + $1 * points AND points > 0";
 
 impl Store {
     /// The trace of a walk in the order of its points. Empty for walks of earlier versions and without a trace.
@@ -37,6 +41,16 @@ async fn stored(transaction: &mut Transaction, walk: WalkId) -> Result<Vec<Trace
     let row = query("SELECT * FROM walk_trace WHERE walk = $1").bind(walk.0);
     let trace: Option<StoredTrace> = row.fetch_optional(transaction).await?;
     Ok(trace.map(|trace| trace.0).unwrap_or_default())
+}
+
+/// γ_max under the original mixture at the last point of each trace, by walk, within a transaction.
+pub(super) async fn last_original_grades(transaction: &mut Transaction) -> Result<BTreeMap<u32, f64>> {
+    if !transaction.has_table(TABLE).await? {
+        return Ok(BTreeMap::new());
+    }
+    let rows: Vec<(u32, Vec<u8>)> = query(LAST_NUMBERS).bind(POINT_BYTES).fetch_all(transaction).await?;
+    let grade = |(walk, last): (u32, Vec<u8>)| Some((walk, f64::from_le_bytes(last.try_into().ok()?)));
+    Ok(rows.into_iter().filter_map(grade).filter(|(_, gamma)| gamma.is_finite()).collect())
 }
 
 /// Adds new points to the traces of their walks, and thins these.

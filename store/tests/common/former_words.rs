@@ -8,22 +8,24 @@ use wire::{Origin, WalkId};
 use super::{candidate, commit_of, name_of, protocol, walk};
 
 /// Turns the tables into those of version 20, without the number of the version.
-pub const TO_VERSION_20: &str = "DROP TABLE trajectory; DELETE FROM _sqlx_migrations WHERE version > 20";
+pub const TO_VERSION_20: &str =
+    "DROP TABLE sample; DROP TABLE trajectory; DELETE FROM _sqlx_migrations WHERE version > 20";
 
 /// Turns the tables into those of version 19, without the number of the version.
-pub const TO_VERSION_19: &str = "DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume;
+pub const TO_VERSION_19: &str =
+    "DROP TABLE sample; DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume;
     ALTER TABLE walk_progress DROP COLUMN reference_step; DELETE FROM _sqlx_migrations WHERE version > 19";
 
 /// Turns the tables into those of version 17, without the number of the version.
 pub const TO_VERSION_17: &str = "DROP INDEX job_order;
-    DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
+    DROP TABLE sample; DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
     DROP TABLE walk_trace; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
     CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
     DELETE FROM _sqlx_migrations WHERE version > 17";
 
 /// Turns the tables into those of version 16, without the number of the version.
 pub const TO_VERSION_16: &str = "DROP INDEX job_order;
-    DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
+    DROP TABLE sample; DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
     DROP TABLE walk_trace; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
     CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
     DROP TABLE version_file; DROP TABLE version;
@@ -33,7 +35,7 @@ pub const TO_VERSION_16: &str = "DROP INDEX job_order;
 /// of the candidate is unknown, since no program of this version writes its word.
 pub const TO_VERSION_15: &str = "
     DROP INDEX job_order;
-    DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
+    DROP TABLE sample; DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
     DROP TABLE walk_trace; ALTER TABLE job DROP COLUMN value; ALTER TABLE job DROP COLUMN value_factors;
     CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
     DROP TABLE version_file; DROP TABLE version;

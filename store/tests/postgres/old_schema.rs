@@ -20,7 +20,7 @@ const WITHOUT_CHECKSUMS: &str = "
     ALTER TABLE label DROP COLUMN checksum, DROP COLUMN excluded, DROP COLUMN exclusion;
     ALTER TABLE walk DROP COLUMN checksum, DROP COLUMN checkpoint_checksum;
     ALTER TABLE import DROP COLUMN checksum; ALTER TABLE archive DROP COLUMN checksum;
-    DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
+    DROP TABLE sample; DROP TABLE trajectory; DROP TABLE assignment; DROP TABLE reference_volume; ALTER TABLE walk_progress DROP COLUMN reference_step;
     DROP TABLE walk_trace; DROP INDEX job_order; ALTER TABLE job DROP COLUMN value, DROP COLUMN value_factors;
     CREATE INDEX job_order ON job (state, priority DESC, decision, protocol);
     DROP TABLE walk_conditions; DROP TABLE version_file; DROP TABLE version;
