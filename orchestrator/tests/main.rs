@@ -10,6 +10,7 @@ mod nothing_new;
 mod reactor;
 mod replay;
 mod reproducible;
+mod simulation;
 mod supervisor;
 mod versions;
 mod walks;

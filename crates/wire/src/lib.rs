@@ -22,6 +22,9 @@ pub mod transport;
 mod walk_frame;
 mod walk_trace;
 
+#[doc(hidden)]
+pub use protocol::datagram;
+
 pub use block::{BlockError, Candidate, CandidateBlock, CandidateView};
 pub use completion::{CompletionCoefficients, CompletionPredictors};
 pub use conditions::{CellConditions, ConstantPressure, WalkConditions};

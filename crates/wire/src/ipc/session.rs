@@ -33,8 +33,7 @@ impl IpcSession {
     /// Handles the exit of a walker's process. Does nothing if the process already has a successor, whose resources must
     /// not be freed.
     pub(super) fn walker_lost(&mut self, walker: u32, incarnation: u32, crashed: bool) {
-        if self.walkers.incarnation(walker) == Some(incarnation) {
-            self.walkers.remove(walker, crashed);
+        if self.walkers.process_ended(walker, incarnation, crashed) {
             self.walkers.transport.close(walker);
             self.mixtures.release(walker);
         }

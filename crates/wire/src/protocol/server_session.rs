@@ -101,6 +101,15 @@ impl<T: ServerTransport> ServerSession<T> {
         self.outbox.push_back(Incoming::Lost { walker, crashed });
     }
 
+    /// Handles the exit of a walker's process. Does nothing, and returns `false`, if the process already has a successor.
+    pub(crate) fn process_ended(&mut self, walker: u32, incarnation: u32, crashed: bool) -> bool {
+        let is_current = self.incarnation(walker) == Some(incarnation);
+        if is_current {
+            self.remove(walker, crashed);
+        }
+        is_current
+    }
+
     /// Handles a message of a walker. `block` is the candidate that came with it, or empty.
     pub(crate) fn receive(
         &mut self,

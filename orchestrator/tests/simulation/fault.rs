@@ -1,0 +1,259 @@
+//! Faults: what goes wrong, and when. A plan is drawn from the seed before the simulation begins, so that a shrunk plan
+//! is a plan as well.
+
+use std::fmt;
+
+use super::random::Random;
+use super::scenario::Scenario;
+
+/// Virtual time, ms since the start.
+pub type Time = u64;
+
+/// Faults begin before this time.
+const LAST_BEGIN: Time = 70_000;
+/// Longest time that a fault lasts.
+const LONGEST: Time = 40_000;
+
+/// A fault of a plan.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PlannedFault {
+    pub at: Time,
+    pub fault: Fault,
+}
+
+/// What goes wrong.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Fault {
+    /// Messages between a walker and the orchestrator, in one direction.
+    Link {
+        walker: u32,
+        direction: Direction,
+        trouble: LinkTrouble,
+        until: Time,
+    },
+    /// The next write of this client.
+    NextWrite {
+        client: ClientKind,
+        moment: Moment,
+    },
+    /// No client reaches the store.
+    StoreAway {
+        until: Time,
+    },
+    /// Reads succeed, writes do not.
+    StoreFull {
+        until: Time,
+    },
+    KillWalker {
+        walker: u32,
+        crash: bool,
+    },
+    StopWalker {
+        walker: u32,
+        until: Time,
+    },
+    KillLabeller {
+        labeller: u32,
+        crash: bool,
+    },
+    StopLabeller {
+        labeller: u32,
+        until: Time,
+    },
+    /// A second process with the same number.
+    StartLabellerTwice {
+        labeller: u32,
+    },
+    KillOrchestrator,
+    /// Asked to stop in order, and started again later.
+    StopInOrder,
+    /// A second orchestrator is started while the first one runs.
+    StartOrchestratorTwice,
+    /// The orchestrator hangs; on a server its lock is lost, and another one takes over.
+    Hang {
+        until: Time,
+    },
+    /// The wall clock of the host jumps.
+    ClockJump {
+        milliseconds: i64,
+    },
+    /// A person drops a label job.
+    DropJob,
+    /// A person requeues a job that failed or was dropped.
+    RetryJob,
+    /// A person pauses the walks, and resumes them.
+    PauseWalks {
+        until: Time,
+    },
+    /// A calculation is killed, with everything that it would have computed.
+    KillCalculation,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Direction {
+    ToOrchestrator,
+    ToWalker,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LinkTrouble {
+    /// Every message is lost: a partition, in one direction.
+    Cut,
+    /// Some messages are lost.
+    Loss,
+    /// Messages arrive up to some seconds late, in another order.
+    Delay,
+    /// Messages arrive several times.
+    Repetition,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ClientKind {
+    Orchestrator,
+    Labeller,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Moment {
+    /// Nothing is written.
+    BeforeCommit,
+    /// Everything is written, and the answer is lost.
+    AfterCommit,
+}
+
+impl Fault {
+    fn draw(random: &mut Random, scenario: &Scenario, at: Time) -> Self {
+        let walker = random.below(scenario.walkers.into()) as u32;
+        let labeller = random.below(scenario.labellers.into()) as u32;
+        let until = at + random.between(2_000, LONGEST);
+        let crash = random.happens(30);
+        match random.below(22) {
+            0..4 => {
+                let direction = [Direction::ToOrchestrator, Direction::ToWalker][random.below(2) as usize];
+                let troubles =
+                    [LinkTrouble::Cut, LinkTrouble::Loss, LinkTrouble::Delay, LinkTrouble::Repetition];
+                Self::Link { walker, direction, trouble: troubles[random.below(4) as usize], until }
+            }
+            4..8 => {
+                let client = [ClientKind::Orchestrator, ClientKind::Labeller][random.below(2) as usize];
+                let moment = [Moment::BeforeCommit, Moment::AfterCommit][random.below(2) as usize];
+                Self::NextWrite { client, moment }
+            }
+            8 => Self::StoreAway { until },
+            9 => Self::StoreFull { until },
+            10 => Self::KillWalker { walker, crash },
+            11 => Self::StopWalker { walker, until: until + LONGEST },
+            12 => Self::KillLabeller { labeller, crash },
+            13 => Self::StopLabeller { labeller, until: until + LONGEST },
+            14 => Self::StartLabellerTwice { labeller },
+            15 => Self::KillOrchestrator,
+            16 => Self::StopInOrder,
+            17 => Self::StartOrchestratorTwice,
+            18 => Self::Hang { until },
+            19 if random.happens(50) => {
+                Self::ClockJump { milliseconds: random.between(0, 7_200_000).cast_signed() - 3_600_000 }
+            }
+            19 => Self::KillCalculation,
+            20 if random.happens(50) => Self::DropJob,
+            20 => Self::RetryJob,
+            _ => Self::PauseWalks { until },
+        }
+    }
+
+    /// When it is over.
+    pub fn end(&self, at: Time) -> Time {
+        match self {
+            Self::Link { until, .. }
+            | Self::StoreAway { until }
+            | Self::StoreFull { until }
+            | Self::StopWalker { until, .. }
+            | Self::StopLabeller { until, .. }
+            | Self::Hang { until }
+            | Self::PauseWalks { until } => *until,
+            _ => at,
+        }
+    }
+}
+
+/// The plan of a seed, in order of time.
+pub fn plan(seed: u64, scenario: &Scenario) -> Vec<PlannedFault> {
+    let mut random = Random::new(seed ^ 0x00fa_u64.rotate_left(40));
+    let number = random.between(2, 9);
+    let mut plan: Vec<PlannedFault> = (0..number)
+        .map(|_| {
+            let at = random.below(LAST_BEGIN);
+            PlannedFault { at, fault: Fault::draw(&mut random, scenario, at) }
+        })
+        .collect();
+    plan.sort_by_key(|planned| planned.at);
+    // A third crash in the same assignment would end its walk, and a reproducible campaign would differ.
+    let mut crashes = 0;
+    for PlannedFault { fault, .. } in &mut plan {
+        if let Fault::KillWalker { crash, .. } = fault {
+            crashes += u32::from(*crash);
+            *crash &= crashes <= 2;
+        }
+    }
+    plan
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let seconds = |time: &Time| *time as f64 / 1000.0;
+        match self {
+            Self::Link { walker, direction, trouble, until } => {
+                let what = match trouble {
+                    LinkTrouble::Cut => "no message arrives",
+                    LinkTrouble::Loss => "messages are lost",
+                    LinkTrouble::Delay => "messages are late",
+                    LinkTrouble::Repetition => "messages are repeated",
+                };
+                let way = match direction {
+                    Direction::ToOrchestrator => format!("from walker {walker} to the orchestrator"),
+                    Direction::ToWalker => format!("from the orchestrator to walker {walker}"),
+                };
+                write!(f, "{what} {way}, until {} s", seconds(until))
+            }
+            Self::NextWrite { client, moment } => {
+                let who = match client {
+                    ClientKind::Orchestrator => "the orchestrator",
+                    ClientKind::Labeller => "a labeller",
+                };
+                match moment {
+                    Moment::BeforeCommit => write!(f, "the next write of {who} will fail"),
+                    Moment::AfterCommit => {
+                        write!(f, "the answer to the next write of {who} will be lost after its COMMIT")
+                    }
+                }
+            }
+            Self::StoreAway { until } => {
+                write!(f, "the database cannot be reached until {} s", seconds(until))
+            }
+            Self::StoreFull { until } => write!(f, "the disk is full until {} s", seconds(until)),
+            Self::KillWalker { walker, crash: false } => write!(f, "walker {walker} is killed"),
+            Self::KillWalker { walker, crash: true } => write!(f, "walker {walker} crashes"),
+            Self::StopWalker { walker, until } => {
+                write!(f, "walker {walker} hangs until {} s", seconds(until))
+            }
+            Self::KillLabeller { labeller, crash: false } => write!(f, "labeller {labeller} is killed"),
+            Self::KillLabeller { labeller, crash: true } => write!(f, "labeller {labeller} crashes"),
+            Self::StopLabeller { labeller, until } => {
+                write!(f, "labeller {labeller} hangs until {} s", seconds(until))
+            }
+            Self::StartLabellerTwice { labeller } => write!(f, "labeller {labeller} is started twice"),
+            Self::KillOrchestrator => f.write_str("the orchestrator is killed"),
+            Self::StopInOrder => f.write_str("the run is asked to stop"),
+            Self::StartOrchestratorTwice => f.write_str("a second orchestrator is started"),
+            Self::Hang { until } => write!(f, "the orchestrator hangs until {} s", seconds(until)),
+            Self::ClockJump { milliseconds } => {
+                write!(f, "the clock jumps by {} s", *milliseconds as f64 / 1000.0)
+            }
+            Self::DropJob => f.write_str("a person drops a label job"),
+            Self::RetryJob => f.write_str("a person requeues a label job"),
+            Self::PauseWalks { until } => {
+                write!(f, "a person pauses all walks until {} s", seconds(until))
+            }
+            Self::KillCalculation => f.write_str("a calculation is killed"),
+        }
+    }
+}

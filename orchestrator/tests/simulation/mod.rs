@@ -1,0 +1,182 @@
+//! A cluster in a box: a whole campaign in one thread, in virtual time, with faults from one random seed.
+//!
+//! Real are the selector, the core of the reactor, the protocol of walkers at both ends, the supervisor, and the store with
+//! all of its SQL. Stand-ins are at the edges: links, processes, clocks, the layer of faults before the store, walks,
+//! calculations, and labellers, which follow the rules of `workers::labeller`. docs/simulation.md says more.
+//!
+//! `CALMWALK_SEEDS=10000` simulates so many seeds, `CALMWALK_SEED=17` one seed, with its story.
+
+mod calculation;
+mod fault;
+mod faulty_store;
+mod invariants;
+mod labeller;
+mod planted;
+mod random;
+mod run;
+mod scenario;
+mod shrink;
+mod walker;
+mod world;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::{LazyLock, Mutex};
+
+use store::{CampaignRecord, Protocol, SeedStructure, Store};
+use tempfile::TempDir;
+
+use self::fault::{PlannedFault, plan};
+use self::planted::PlantedBug;
+use self::scenario::{SEED_STRUCTURES, Scenario};
+use self::world::{Outcome, World};
+use crate::common::{CAMPAIGN, seed_structure};
+
+/// Number of seeds that the tests simulate.
+const SEEDS: u64 = 150;
+/// A planted bug must be found within this number of seeds.
+const SEEDS_TO_FIND: u64 = 1_000;
+
+/// A directory in memory, if the system has one: nothing is to be kept.
+fn directory() -> TempDir {
+    let memory = Path::new("/dev/shm");
+    if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() }.unwrap()
+}
+
+/// A new campaign, which each simulation copies.
+static NEW_CAMPAIGN: LazyLock<TempDir> = LazyLock::new(|| {
+    let directory = directory();
+    let campaign = CampaignRecord {
+        id: CAMPAIGN,
+        program_version: "0.1.0".into(),
+        mode: "live".into(),
+        configuration: String::new(),
+        resolved_configuration: "{}".into(),
+        configuration_in_force: "{}".into(),
+    };
+    let seeds: Vec<_> = (0..SEED_STRUCTURES)
+        .map(|number| SeedStructure {
+            index: number as u32,
+            name: seed_structure(number).name,
+            source: "seeds.extxyz".into(),
+            structure: seed_structure(number).structure,
+        })
+        .collect();
+    let protocol =
+        Protocol { hash: labeller::PROTOCOL, name: "reference".into(), settings: serde_json::json!({}) };
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let store = Store::create(directory.path(), &campaign, &seeds, 0).await.unwrap();
+        store.add_protocol(&protocol, 0).await.unwrap();
+        store.close().await;
+    });
+    directory
+});
+
+/// The decision log of the undisturbed run of each reproducible scenario.
+static UNDISTURBED: Mutex<BTreeMap<u64, String>> = Mutex::new(BTreeMap::new());
+
+/// Simulates a campaign with these faults.
+fn simulate(seed: u64, faults: &[PlannedFault], bug: Option<PlantedBug>) -> Outcome {
+    let directory = directory();
+    let database = directory.path().join(store::DATABASE);
+    std::fs::copy(NEW_CAMPAIGN.path().join(store::DATABASE), &database).unwrap();
+    let mut outcome = World::new(seed, faults.to_vec(), bug, directory.path()).run();
+    let scenario = Scenario::of(seed);
+    if outcome.violation.is_none() && scenario.is_reproducible() && !(bug.is_none() && faults.is_empty()) {
+        let undisturbed = undisturbed_log(&scenario);
+        if outcome.log != undisturbed {
+            let line = undisturbed.lines().zip(outcome.log.lines()).position(|(a, b)| a != b);
+            outcome.violation = Some(format!(
+                "the decision log is not that of the undisturbed run: {} and {} lines, the first difference in line {line:?}",
+                outcome.log.lines().count(),
+                undisturbed.lines().count()
+            ));
+        }
+    }
+    outcome
+}
+
+fn undisturbed_log(scenario: &Scenario) -> String {
+    if let Some(log) = UNDISTURBED.lock().unwrap().get(&scenario.number) {
+        return log.clone();
+    }
+    let outcome = simulate(scenario.number, &[], None);
+    assert_eq!(outcome.violation, None, "{}", outcome.story.join("\n"));
+    UNDISTURBED.lock().unwrap().insert(scenario.number, outcome.log.clone());
+    outcome.log
+}
+
+/// Whether a seed breaks an invariant.
+fn breaks(seed: u64, bug: Option<PlantedBug>) -> bool {
+    simulate(seed, &plan(seed, &Scenario::of(seed)), bug).violation.is_some()
+}
+
+/// Simulates a seed; if it breaks an invariant, shrinks its faults and tells the story.
+fn check(seed: u64) -> Outcome {
+    let faults = plan(seed, &Scenario::of(seed));
+    let outcome = simulate(seed, &faults, None);
+    if outcome.violation.is_some() {
+        panic!("{}", shrink::story_of_failure(seed, &faults, None));
+    }
+    outcome
+}
+
+fn number_in(variable: &str) -> Option<u64> {
+    std::env::var(variable).ok().map(|text| text.parse().expect("a number"))
+}
+
+#[test]
+fn no_seed_breaks_an_invariant() {
+    if let Some(seed) = number_in("CALMWALK_SEED") {
+        let outcome = check(seed);
+        println!("{}", outcome.story.join("\n"));
+        return;
+    }
+    let seeds = number_in("CALMWALK_SEEDS").unwrap_or(SEEDS);
+    let (mut events, mut time) = (0, 0);
+    for seed in 0..seeds {
+        let outcome = check(seed);
+        events += outcome.events;
+        time += outcome.ended;
+    }
+    println!("{seeds} seeds, {events} events, {} h of virtual time", time / 3_600_000);
+}
+
+#[test]
+fn a_seed_determines_every_event() {
+    for seed in [3, 4, 10] {
+        let faults = plan(seed, &Scenario::of(seed));
+        let [first, second] = [(); 2].map(|()| simulate(seed, &faults, None));
+        assert_eq!(first.story, second.story);
+        assert_eq!((first.hash, first.events, first.ended), (second.hash, second.events, second.ended));
+    }
+    let hashes: std::collections::BTreeSet<u64> =
+        [3, 4, 10].map(|seed| simulate(seed, &plan(seed, &Scenario::of(seed)), None).hash).into();
+    assert_eq!(hashes.len(), 3);
+}
+
+/// Every planted bug is found. Without `CALMWALK_SEEDS`, the search begins with the seed that found it last.
+#[test]
+fn planted_bugs_are_found() {
+    let all = number_in("CALMWALK_SEEDS").is_some();
+    let mut missed = Vec::new();
+    for bug in PlantedBug::ALL {
+        let first = if all { None } else { bug.found_by() };
+        let found = first.into_iter().chain(0..SEEDS_TO_FIND).find(|seed| breaks(*seed, Some(bug)));
+        match found {
+            Some(seed) => println!("{bug:?}: seed {seed}"),
+            None => missed.push(bug),
+        }
+    }
+    assert!(missed.is_empty(), "{missed:?}");
+}
+
+/// A shrunk plan is small, and its story names what happened.
+#[test]
+fn failures_are_shrunk_to_a_story() {
+    let bug = Some(PlantedBug::LostLeaseForgotten);
+    let seed = (0..SEEDS_TO_FIND).find(|seed| breaks(*seed, bug)).unwrap();
+    let story = shrink::story_of_failure(seed, &plan(seed, &Scenario::of(seed)), bug);
+    assert!(story.contains("1 fault") && story.contains("will be lost after its COMMIT"), "{story}");
+}

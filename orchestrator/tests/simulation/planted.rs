@@ -1,0 +1,73 @@
+//! Mistakes that are made on purpose, to see that the simulation finds them. They are made at the edges, never in the
+//! program itself.
+
+/// A mistake.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum PlantedBug {
+    /// Walkers are answered while the commit is still being written.
+    AnswerBeforeCommit,
+    /// The orchestrator takes a commit that failed for one that was made.
+    FailedCommitBelieved,
+    /// A commit whose answer was lost is made again, without looking whether it was made.
+    CommitRepeated,
+    /// Labellers do not say which leases they know of: one whose COMMIT answer was lost lasts as long as its holder.
+    LostLeaseForgotten,
+    /// A lease that is renewed returns to the queue as well.
+    LeaseGivenTwice,
+    /// A replaced orchestrator may still write.
+    FenceForgotten,
+    /// A second orchestrator starts although the first one holds the lock.
+    LockIgnored,
+    /// Every process of a walker has the same incarnation.
+    IncarnationIgnored,
+    /// Commits with candidates do not contain the checkpoints of their walks.
+    CheckpointForgotten,
+    /// Walkers see the newest version number of the mixture with the components of the version before.
+    TornMixture,
+    /// A calculation is started before it is recorded.
+    CalculationRecordedLate,
+    /// A labeller starts a calculation without looking for an earlier one.
+    CalculationNotLookedUp,
+    /// The orchestrator reads only once which walks are paused.
+    PauseRemembered,
+    /// The orchestrator reads only once how long the label queue is.
+    QueueLengthRemembered,
+    /// A labeller continues although another one has replaced it.
+    ReplacedLabellerContinues,
+    /// A run ends with the last walk, although structures wait for labels.
+    QueueAbandoned,
+    /// After a restart the selector does not know which structures were accepted.
+    KnownStructuresForgotten,
+    /// After a restart the selector begins with the original mixture.
+    MixtureForgotten,
+}
+
+impl PlantedBug {
+    pub const ALL: [Self; 18] = [
+        Self::AnswerBeforeCommit,
+        Self::FailedCommitBelieved,
+        Self::CommitRepeated,
+        Self::LostLeaseForgotten,
+        Self::LeaseGivenTwice,
+        Self::FenceForgotten,
+        Self::LockIgnored,
+        Self::IncarnationIgnored,
+        Self::CheckpointForgotten,
+        Self::TornMixture,
+        Self::CalculationRecordedLate,
+        Self::CalculationNotLookedUp,
+        Self::PauseRemembered,
+        Self::QueueLengthRemembered,
+        Self::ReplacedLabellerContinues,
+        Self::QueueAbandoned,
+        Self::KnownStructuresForgotten,
+        Self::MixtureForgotten,
+    ];
+}
+
+impl PlantedBug {
+    /// A seed that found it, with which the search begins.
+    pub fn found_by(self) -> Option<u64> {
+        None
+    }
+}
