@@ -4,12 +4,14 @@ use std::future::poll_fn;
 use std::io;
 use std::os::fd::{BorrowedFd, OwnedFd};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use iceoryx2::port::ReceiveError;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::FileDescriptorBased;
 use tokio::io::unix::AsyncFd;
 use tokio::sync::mpsc;
+use tokio::time::{MissedTickBehavior, interval};
 
 use super::config::{self, ServerPort, Service};
 use super::connections::{Traffic, WalkerConnections};
@@ -22,6 +24,8 @@ use crate::transport::Incoming;
 
 /// Maximum number of messages handled before other events.
 const BATCH: usize = 64;
+/// Interval at which the server looks for messages that no event has told of (see [`take_events`]).
+const POLL_INTERVAL: Duration = Duration::from_millis(200);
 
 /// The orchestrator's end of the transport. Walkers can connect as soon as it is open; [`IpcServer::run`] handles their
 /// messages.
@@ -135,6 +139,8 @@ impl IpcServer {
         let mut session =
             IpcSession::new(self.handle.connect_info.sender.session, mixtures, self.connections);
         let wakeup = descriptor(&self.wakeup).map_err(|e| IpcError::new("wait for events", e))?;
+        let mut poll = interval(POLL_INTERVAL);
+        poll.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut more = false;
         loop {
             tokio::select! {
@@ -165,13 +171,31 @@ impl IpcServer {
                 () = tokio::task::yield_now(), if more => more = receive_batch(&self.port, &mut session, &mut on_message)?,
                 guard = wakeup.readable() => {
                     let mut guard = guard.map_err(|e| IpcError::new("wait for events", e))?;
-                    self.wakeup.try_wait(|_| {}).map_err(|e| IpcError::new("take in events", e))?;
+                    take_events(&self.wakeup)?;
                     guard.clear_ready();
+                    more = receive_batch(&self.port, &mut session, &mut on_message)?;
+                }
+                _ = poll.tick() => {
+                    take_events(&self.wakeup)?;
                     more = receive_batch(&self.port, &mut session, &mut on_message)?;
                 }
             }
         }
     }
+}
+
+/// Takes in events, until there are none.
+///
+/// A notifier of iceoryx2 0.10 writes to the socket only if its listener has taken in what was notified before. What is notified while events
+/// are taken in may lose its datagram to that, and then no notifier writes again: the socket stays silent. Taking in events once more ends
+/// that. A notification between the last look and its mark is left to the poll.
+fn take_events(wakeup: &Listener<Service>) -> Result<(), IpcError> {
+    for _ in 0..BATCH {
+        if wakeup.try_wait(|_| {}).map_err(|e| IpcError::new("take in events", e))? == 0 {
+            break;
+        }
+    }
+    Ok(())
 }
 
 /// Handles received messages. Returns whether there may be more.

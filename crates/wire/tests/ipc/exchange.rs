@@ -1,7 +1,7 @@
 //! Exchange of assignments and reports.
 
 use super::process::Role;
-use super::test_server::{TestServer, check, work};
+use super::test_server::{Offer, TestServer, check, work};
 
 /// Messages of 1 kB to 4 MB, in memory reserved for smaller ones.
 #[tokio::test(flavor = "multi_thread")]
@@ -54,6 +54,27 @@ async fn candidates_live_as_long_as_they_are_used() {
     assert_eq!(held.len(), 22);
     assert_eq!(server.handle.traffic().rejected, 0, "{:?}", server.handle.traffic());
     drop(held);
+    server.close().await;
+}
+
+/// Walkers that send at the same moment, again and again: a wake-up that is lost would leave them without an answer.
+#[tokio::test(flavor = "multi_thread")]
+async fn bursts_of_messages_are_all_answered() {
+    const WALKERS: u32 = 16;
+    const ROUNDS: u64 = 300;
+    let directory = tempfile::tempdir().unwrap();
+    let mut server = TestServer::open(directory.path(), WALKERS, 1 << 14);
+    let mut walkers: Vec<_> = (0..WALKERS).map(|walker| server.start(walker, 1, Role::Walker)).collect();
+    for number in 1..=ROUNDS {
+        let mut waiting = Vec::new();
+        while waiting.len() < walkers.len() {
+            waiting.push(server.offer().await);
+        }
+        for Offer { walker, reply, .. } in waiting {
+            reply.send((number < ROUNDS).then(|| work(walker, number, (1, 1)))).unwrap();
+        }
+    }
+    assert!(walkers.iter_mut().all(|walker| walker.wait().unwrap().success()));
     server.close().await;
 }
 

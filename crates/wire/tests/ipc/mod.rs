@@ -1,5 +1,6 @@
 //! The transport between real processes.
 
+mod calls;
 mod exchange;
 mod losses;
 mod process;
