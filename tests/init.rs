@@ -165,6 +165,56 @@ fn what_is_wrong_is_said_and_nothing_is_written() {
     );
 }
 
+/// One crystal and a model of one element: cell-biased walks from four volumes at constant pressure.
+#[test]
+fn a_model_of_one_phase_gets_the_collection_of_the_paper() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    prepare(here);
+    let crystal = &read_extxyz(&here.join("seeds.extxyz")).unwrap()[..1];
+    write_frames(&here.join("seeds.extxyz"), crystal);
+    let teacher = teacher();
+    for more in [&["--full"][..], &[]] {
+        let options = options("potential", &[&["--label-source", &teacher][..], more].concat());
+        succeed(here, options);
+        let text = written(here);
+        let lines = [
+            "min_atoms = 108 ",
+            "barostat = { pressure = 1.0 } ",
+            "cell_bias = {} ",
+            "start_volumes = [0.94, 0.97, 1.03, 1.06] ",
+            "max_per_walk = 50 ",
+            "max_structures = 200 ",
+            "update = \"per_walk\" ",
+            "walks_per_round = 1 ",
+        ];
+        for line in lines {
+            assert!(text.contains(&format!("\n{line}")), "{line}: {text}");
+        }
+        assert!(!text.contains("\nvolume_ramp") && !text.contains("\ncovariance_update"), "{text}");
+        assert!(succeed(here, ["validate", CONFIG]).contains("is a valid campaign"));
+        if more.is_empty() {
+            // Shorter, and of a smaller crystal.
+            let short = text.replace("min_atoms = 108", "min_atoms = 32");
+            let short = short.replace("biased_steps = 100000", "biased_steps = 30\nreference_steps = 20");
+            let short = short.replace("\ntau = ", "\nequilibration_steps = 10\ntau = ");
+            fs::write(here.join(CONFIG), short).unwrap();
+            succeed(here, ["run", "--in-process", CONFIG]);
+            let status: Value = serde_json::from_str(&succeed(here, ["status", "own", "--json"])).unwrap();
+            let walks = status["walks"].as_array().unwrap();
+            let constant = |walk: &Value| walk["conditions"]["constant_pressure"].clone();
+            let biased = walks.iter().filter(|walk| walk["origin"] == "biased");
+            let volumes: Vec<_> =
+                biased.map(|walk| constant(walk)["start_volume"].as_f64().unwrap()).collect();
+            assert_eq!(volumes, [0.94, 0.97, 1.03, 1.06], "{status}");
+            assert!(walks.iter().all(|walk| constant(walk)["cell_bias"] == true), "{status}");
+        }
+        for name in ["campaign.toml", "campaign.schema.json"] {
+            fs::remove_file(here.join("own").join(name)).unwrap();
+        }
+    }
+}
+
 #[test]
 fn without_an_artifact_the_mixture_of_the_model_stays_as_it_is() {
     let directory = tempfile::tempdir().unwrap();

@@ -372,7 +372,7 @@ fn energies_far_from_the_others_are_told_and_recorded() {
     labels.energy = labels.energy.map(|energy| energy + 100.0);
     frames[1].set_labels(&labels, LabelKeys::Ase);
     write_frames(&here.join("replay.extxyz"), &frames);
-    let native = json!({ "native": { "epochs": 1, "validation_share": 0.0 } });
+    let native = json!({ "native": { "epochs": 1, "learning_rate": 1e-3, "validation_share": 0.0 } });
     let output = refit(here, &settings(here, "campaign", native));
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(0), "{said}");
@@ -393,7 +393,7 @@ fn errors_are_those_of_the_test_sets_as_they_are() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     prepare(here);
-    let native = json!({ "native": { "epochs": 1, "validation_share": 0.0 } });
+    let native = json!({ "native": { "epochs": 1, "learning_rate": 1e-3, "validation_share": 0.0 } });
     let structures = |sets: &Json| sets[0]["structures"].as_u64();
     kill_at(here, &settings(here, "campaign", native.clone()), &here.join("campaign/refit/1/errors.json"));
     let kept = fs::read(here.join("campaign/refit/1/errors.json")).unwrap();

@@ -36,7 +36,7 @@ replay = ["replay.extxyz"]
 after_structures = 8
 max_versions = 2
 held_out = 0.0
-method = { native = { epochs = 2, validation_share = 0.0 } }
+method = { native = { epochs = 2, learning_rate = 1e-3, validation_share = 0.0 } }
 "#;
 
 #[test]
@@ -160,7 +160,7 @@ after_structures = 3
 max_versions = 9
 held_out = 0.5
 max_held_out_error_ratio = 10.0
-method = { native = { epochs = 1, validation_share = 0.0 } }
+method = { native = { epochs = 1, learning_rate = 1e-3, validation_share = 0.0 } }
 [stop]
 min_improvement = 100.0
 "#;
@@ -194,7 +194,7 @@ replay = ["replay.extxyz"]
 after_structures = 2
 max_versions = 1
 held_out = 0.0
-method = { native = { epochs = 1, validation_share = 0.0 } }
+method = { native = { epochs = 1, learning_rate = 1e-3, validation_share = 0.0 } }
 "#;
 
 /// Gives structures with a vacancy an energy that nothing explains.
@@ -455,7 +455,7 @@ after_structures = 6
 max_versions = 1
 held_out = 0.0
 max_attempts = 1
-method = { native = { epochs = 1, validation_share = 0.0 } }
+method = { native = { epochs = 1, learning_rate = 1e-3, validation_share = 0.0 } }
 "#;
 
 /// A model file that changed, and a disk that cannot be written, refuse nothing.

@@ -3,6 +3,7 @@
 mod create;
 mod label_kind;
 mod label_section;
+mod one_phase;
 mod own_campaign;
 mod questions;
 mod suggestion;

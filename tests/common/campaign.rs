@@ -23,7 +23,7 @@ pub struct Small {
     pub refit: &'static str,
 }
 
-/// Two versions of the potential, trained in a second each. Of the two default seed structures, one is held out.
+/// Two versions of the potential, trained in a second each, with a small rate: there are few updates. Of the two default seed structures, one is held out.
 pub const TWO_VERSIONS: &str = r#"
 [refit]
 replay = ["replay.extxyz"]
@@ -34,7 +34,7 @@ max_held_out_error_ratio = 10.0
 max_attempts = 100
 control_frames = "compare"
 start = "first"
-method = { native = { epochs = 2, validation_share = 0.0 } }
+method = { native = { epochs = 2, learning_rate = 1e-3, validation_share = 0.0 } }
 test_sets = [{ name = "known", file = "replay.extxyz" }]
 comparisons = [{ name = "known", file = "replay.extxyz" }]
 "#;

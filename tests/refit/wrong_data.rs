@@ -7,7 +7,7 @@ use super::*;
 
 /// A short training by calmwalk itself.
 fn native(changes: Json) -> Json {
-    let mut native = json!({ "epochs": 1, "validation_share": 0.0 });
+    let mut native = json!({ "epochs": 1, "learning_rate": 1e-3, "validation_share": 0.0 });
     native.as_object_mut().unwrap().extend(changes.as_object().unwrap().clone());
     json!({ "native": native })
 }

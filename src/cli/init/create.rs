@@ -29,7 +29,8 @@ pub fn create(directory: &Path, options: OwnCampaignArgs) -> Result<ExitStatus, 
         Ok::<_, CommandError>((text, draft))
     };
     let (_, draft) = read(&SuggestedSettings::first_guess())?;
-    let (text, draft) = read(&SuggestedSettings::from_draft(&draft))?;
+    let suggested = SuggestedSettings::from_draft(&draft, campaign.artifact.is_some());
+    let (text, draft) = read(&suggested)?;
     draft.warnings.iter().for_each(log_and_warn);
     write_all(directory, [(CONFIG, text.as_bytes())])?;
     let (unfilled, config) = (text.matches(&format!("\"{FILL_IN}")).count(), config.display());

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use atoms::{Repetition, Species, Structure};
 use potentials::{RadiiWindows, ZblWindow, ZblWindows};
 
+use super::one_phase;
 use crate::campaign::{CampaignDraft, PairRange};
 
 /// Smallest periodic seed structures, as in configs/foundation-campaign.toml: in a smaller cell all copies of an atom move
@@ -39,8 +40,10 @@ const MAX_WALKS_PER_ROUND: usize = 32;
 /// Values of keys.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SuggestedSettings {
-    /// Whether small cells become supercells of [`MIN_ATOMS`] and [`MIN_HEIGHT`].
-    pub supercells: bool,
+    /// Whether the walks are those for a model of one phase.
+    pub is_one_phase: bool,
+    /// Atoms and height, Å, of the supercells that smaller cells become. `None`: no cell is smaller.
+    pub supercells: Option<(usize, f64)>,
     /// Scale τ of the uncertainty force.
     pub tau: f64,
     /// K.
@@ -53,6 +56,8 @@ pub struct SuggestedSettings {
     pub zbl: Option<ZblWindows>,
     /// Elements of the seed structures.
     pub elements: BTreeSet<Species>,
+    /// Biased walks.
+    pub walks: usize,
     /// Biased walks of a round.
     pub walks_per_round: usize,
 }
@@ -61,37 +66,49 @@ impl SuggestedSettings {
     /// Settings with which any model and structures can be read.
     pub fn first_guess() -> Self {
         Self {
-            supercells: false,
+            is_one_phase: false,
+            supercells: None,
             tau: WIDE_TAU,
             temperatures: CRYSTAL_TEMPERATURES,
             volume_ramps: Vec::new(),
             counts_atoms: false,
             zbl: None,
             elements: BTreeSet::new(),
+            walks: 1,
             walks_per_round: 1,
         }
     }
 
-    /// Settings for the model and the structures of a draft with those of the first guess.
-    pub fn from_draft(draft: &CampaignDraft) -> Self {
+    /// Settings for the model and the structures of a draft with those of the first guess. `has_artifact`: the mixture is updated.
+    pub fn from_draft(draft: &CampaignDraft, has_artifact: bool) -> Self {
         let structures = || draft.seed_structures.iter().map(|named| &named.plan.structure);
-        let repetition = |structure: &Structure| Repetition::for_size(structure, MIN_ATOMS, MIN_HEIGHT);
+        let all: Vec<_> = structures().collect();
+        let is_narrow = draft.model.elements().len() < WIDE_DOMAIN;
+        let is_one_phase = has_artifact && is_narrow && one_phase::is_one_phase(&all);
+        let min_atoms = if is_one_phase { one_phase::MIN_ATOMS } else { MIN_ATOMS };
+        let repetition = |structure: &Structure| Repetition::for_size(structure, min_atoms, MIN_HEIGHT);
         let atoms = |structure: &Structure| repetition(structure).cells() * structure.len() as u64;
         let has_volume = |structure: &Structure| structure.periodic != [false; 3];
         let model_elements = draft.model.elements();
         let temperatures =
             if structures().any(has_volume) { CRYSTAL_TEMPERATURES } else { MOLECULE_TEMPERATURES };
         let volume_ramps = volume_ramps(structures().any(has_volume), structures().all(has_volume));
-        let walks = structures().count() * temperatures.len() * volume_ramps.len().max(1);
+        let walks = match is_one_phase {
+            true => one_phase::walks(all.len()),
+            false => all.len() * temperatures.len() * volume_ramps.len().max(1),
+        };
+        let is_small = structures().any(|structure| repetition(structure) != Repetition::ONE);
         Self {
-            supercells: structures().any(|structure| repetition(structure) != Repetition::ONE),
+            is_one_phase,
+            supercells: is_small.then_some((min_atoms, MIN_HEIGHT)),
+            walks,
             tau: if model_elements.len() < WIDE_DOMAIN { NARROW_TAU } else { WIDE_TAU },
             temperatures,
             volume_ramps,
             counts_atoms: structures().all(|structure| atoms(structure) >= MIN_COUNTED_ATOMS),
             zbl: zbl_windows(model_elements, draft.model.cutoff(), &draft.pair_ranges),
             elements: structures().flat_map(|structure| structure.species.iter().copied()).collect(),
-            walks_per_round: walks.clamp(1, MAX_WALKS_PER_ROUND),
+            walks_per_round: if is_one_phase { 1 } else { walks.clamp(1, MAX_WALKS_PER_ROUND) },
         }
     }
 }

@@ -5,8 +5,9 @@ use std::path::Path;
 use potentials::{RadiiWindows, ZblWindow, ZblWindows};
 
 use super::label_section::label_section;
+use super::one_phase;
 use super::own_campaign::OwnCampaign;
-use super::suggestion::{MIN_ATOMS, MIN_HEIGHT, SuggestedSettings};
+use super::suggestion::SuggestedSettings;
 use super::written_section::{WrittenKey, WrittenSection, list, path_value};
 use super::{CAMPAIGN, SCHEMA_LINE};
 use crate::exit_status::CommandError;
@@ -85,10 +86,12 @@ fn file_sections(
             let comment = "its CALM mixture, with scatter matrices and counts";
             let additive =
                 "forgets nothing; the paper: \"convex\", which suits few seed structures".to_owned();
-            vec![
-                WrittenKey::new("artifact", artifact, comment),
-                WrittenKey::new("covariance_update", "\"additive\"", additive),
-            ]
+            let mut keys = vec![WrittenKey::new("artifact", artifact, comment)];
+            keys.push(match settings.is_one_phase {
+                true => one_phase::update_key(),
+                false => WrittenKey::new("covariance_update", "\"additive\"", additive),
+            });
+            keys
         }
         None => {
             let comment = "the mixture of the model stays as it is: an update needs calm.artifact";
@@ -96,8 +99,8 @@ fn file_sections(
         }
     };
     let mut seeds = vec![WrittenKey::new("files", structures, "every frame is a seed structure")];
-    if settings.supercells {
-        let (atoms, height) = (MIN_ATOMS.to_string(), format!("{MIN_HEIGHT:?}"));
+    if let Some((atoms, height)) = settings.supercells {
+        let (atoms, height) = (atoms.to_string(), format!("{height:?}"));
         let comment = "make supercells of periodic cells with fewer atoms";
         let comment = WrittenKey::with_range(comment, "seed_structures.min_atoms");
         seeds.push(WrittenKey::new("min_atoms", atoms, comment));
@@ -114,6 +117,14 @@ fn file_sections(
 
 /// The sections of the dynamics and of what is collected.
 fn walk_sections(settings: &SuggestedSettings) -> [WrittenSection; 5] {
+    let round = "biased walks that advance together, on any machine";
+    let round = WrittenKey::new("walks_per_round", settings.walks_per_round.to_string(), round);
+    let run = WrittenSection::new("[run]", vec![round]);
+    let guard = WrittenSection::new("[guard]", settings.zbl.as_ref().map(zbl_key).into_iter().collect());
+    if settings.is_one_phase {
+        let [walk, group, collect] = one_phase::walk_sections(settings.walks);
+        return [walk, group, collect, guard, run];
+    }
     let ranged = |name, key, value: String, comment| {
         WrittenKey::new(name, value, WrittenKey::with_range(comment, key))
     };
@@ -138,23 +149,12 @@ fn walk_sections(settings: &SuggestedSettings) -> [WrittenSection; 5] {
         let ramps = list(settings.volume_ramps.iter().map(ramp));
         group.push(ranged("volume_ramps", "walk.volume_ramp.to", ramps, "V/V₀"));
     }
-    let guard = settings.zbl.as_ref().map(|windows| {
-        let unit = match windows {
-            ZblWindows::PerPair(_) => {
-                "ZBL repulsion: full below inner, zero above outer; × sum of covalent radii, pairs in Å"
-            }
-            ZblWindows::Uniform(_) => "Å; ZBL repulsion: full below inner, zero above outer",
-        };
-        WrittenKey::new("zbl", zbl_value(windows), unit)
-    });
-    let round = "biased walks that advance together, on any machine";
-    let round = WrittenKey::new("walks_per_round", settings.walks_per_round.to_string(), round);
     [
         WrittenSection::new("[walk]", walk),
         WrittenSection::new("[[walks]]", group),
         WrittenSection::new("[collect]", collect_keys(settings.counts_atoms)),
-        WrittenSection::new("[guard]", guard.into_iter().collect()),
-        WrittenSection::new("[run]", vec![round]),
+        guard,
+        run,
     ]
 }
 
@@ -188,6 +188,17 @@ fn collect_keys(counts_atoms: bool) -> Vec<WrittenKey> {
             "structures of all walks of a seed structure, at most",
         ),
     ]
+}
+
+/// The key of these windows.
+fn zbl_key(windows: &ZblWindows) -> WrittenKey {
+    let unit = match windows {
+        ZblWindows::PerPair(_) => {
+            "ZBL repulsion: full below inner, zero above outer; × sum of covalent radii, pairs in Å"
+        }
+        ZblWindows::Uniform(_) => "Å; ZBL repulsion: full below inner, zero above outer",
+    };
+    WrittenKey::new("zbl", zbl_value(windows), unit)
 }
 
 fn zbl_value(windows: &ZblWindows) -> String {
