@@ -127,7 +127,7 @@ impl Fault {
         let labeller = random.below(scenario.labellers.into()) as u32;
         let until = at + random.between(2_000, LONGEST);
         let crash = random.happens(30);
-        match random.below(22) {
+        match random.below(23) {
             0..4 => {
                 let direction = [Direction::ToOrchestrator, Direction::ToWalker][random.below(2) as usize];
                 let troubles =
@@ -154,6 +154,7 @@ impl Fault {
                 Self::ClockJump { milliseconds: random.between(0, 7_200_000).cast_signed() - 3_600_000 }
             }
             19 => Self::KillCalculation,
+            22 => Self::KillWalkerOften { walker, until: at + 11_000 },
             20 if random.happens(50) => Self::DropJob,
             20 => Self::RetryJob,
             _ => Self::PauseWalks { until },
@@ -167,6 +168,7 @@ impl Fault {
             | Self::StoreAway { until }
             | Self::StoreFull { until }
             | Self::StopWalker { until, .. }
+            | Self::KillWalkerOften { until, .. }
             | Self::StopLabeller { until, .. }
             | Self::Hang { until }
             | Self::PauseWalks { until } => *until,
@@ -234,6 +236,13 @@ impl fmt::Display for Fault {
             Self::KillWalker { walker, crash: true } => write!(f, "walker {walker} crashes"),
             Self::StopWalker { walker, until } => {
                 write!(f, "walker {walker} hangs until {} s", seconds(until))
+            }
+            Self::KillWalkerOften { walker, until } => {
+                write!(
+                    f,
+                    "walker {walker} is killed again and again, with late messages, until {} s",
+                    seconds(until)
+                )
             }
             Self::KillLabeller { labeller, crash: false } => write!(f, "labeller {labeller} is killed"),
             Self::KillLabeller { labeller, crash: true } => write!(f, "labeller {labeller} crashes"),

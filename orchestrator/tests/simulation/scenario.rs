@@ -68,5 +68,5 @@ fn script(random: &mut Random) -> Script {
             Event::Structure { number: random.below(12), z, close: kind == 16 }
         }
     };
-    (0..32).map(&mut event).collect()
+    (0..24).map(&mut event).collect()
 }

@@ -38,6 +38,8 @@ pub enum Event {
     Fault(usize),
     /// The end of a pause of all walks.
     Resume,
+    /// A walker is killed, and again until this time.
+    KillAgain(u32, Time),
     StartRun,
     /// A message arrives at the server of a run.
     ToServer {
@@ -194,12 +196,12 @@ impl World {
             self.now = at;
             events += 1;
             (at, number, std::mem::discriminant(&event)).hash(&mut self.hasher);
-            let writes = self.store.writes;
+            let changes = self.store.changes;
             self.handle(event);
             for remark in std::mem::take(&mut self.store.remarks) {
                 self.tell(remark);
             }
-            if self.store.writes > writes {
+            if self.store.changes > changes {
                 self.check_store();
             }
             self.check_memory();
@@ -293,6 +295,7 @@ impl World {
         match event {
             Event::Fault(number) => self.begin_fault(self.plan[number].fault.clone()),
             Event::Resume => self.pause_walks(false),
+            Event::KillAgain(walker, until) => self.kill_walker_again(walker, until),
             Event::StartRun => self.start_run(),
             Event::ToServer { from, sequence, bytes } => self.message_arrives(from, sequence, bytes),
             Event::ToWalker { to, bytes } => self.answer_arrives(to, bytes),
@@ -337,6 +340,10 @@ impl World {
                     process.stopped_until = until;
                 }
             }
+            Fault::KillWalkerOften { walker, until } => {
+                self.links.push((walker, Direction::ToOrchestrator, LinkTrouble::Delay, until));
+                self.kill_walker_again(walker, until);
+            }
             Fault::KillLabeller { labeller, crash } => {
                 if let Some(id) = self.newest_labeller(labeller) {
                     self.labeller_exits(id, if crash { Exit::Crash } else { Exit::Killed });
@@ -372,6 +379,16 @@ impl World {
                 self.at(until, Event::Resume);
             }
             Fault::KillCalculation => self.kill_calculation(),
+        }
+    }
+
+    fn kill_walker_again(&mut self, walker: u32, until: Time) {
+        if let Some(key) = self.leader().and_then(|run| self.newest_walker(run, walker)) {
+            self.walker_exits(key, Exit::Killed);
+        }
+        let delay = self.random.between(1_500, 3_500);
+        if self.now + delay < until {
+            self.after(delay, Event::KillAgain(walker, until));
         }
     }
 
