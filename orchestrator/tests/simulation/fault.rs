@@ -52,6 +52,11 @@ pub enum Fault {
         walker: u32,
         until: Time,
     },
+    /// Killed again and again, while its messages are late: those of dead processes arrive.
+    KillWalkerOften {
+        walker: u32,
+        until: Time,
+    },
     KillLabeller {
         labeller: u32,
         crash: bool,
