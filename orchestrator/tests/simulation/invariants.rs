@@ -127,6 +127,16 @@ impl World {
         }
     }
 
+    /// Labels exceed their budget by no more than what was under way when it was used up.
+    fn check_budget(&mut self) {
+        let Some(budget) = self.scenario.label_budget else { return };
+        let (labels,): (i64,) = self.ask("SELECT count(*) FROM label WHERE status = 'label'");
+        let limit = budget + u64::from(self.scenario.labellers);
+        if labels.cast_unsigned() > limit {
+            self.fail(format!("there are {labels} labels, with a budget of {budget}"));
+        }
+    }
+
     fn ask<T>(&mut self, sql: &str) -> T
     where
         T: for<'r> sqlx::FromRow<'r, sqlx::sqlite::SqliteRow> + Send + Unpin,
@@ -153,7 +163,9 @@ impl World {
         self.check_store();
         let (waiting,): (i64,) = self.ask("SELECT count(*) FROM job WHERE state IN ('queued', 'leased')");
         let (walks,): (i64,) = self.ask("SELECT count(*) FROM walk WHERE state IN ('waiting', 'running')");
-        if waiting > 0 || walks > 0 {
+        let is_used_up = self.scenario.label_budget.is_some();
+        self.check_budget();
+        if waiting > 0 && !is_used_up || walks > 0 {
             self.fail(format!("the campaign has ended with {waiting} unfinished jobs and {walks} walks"));
         }
         let missing: Vec<String> = self

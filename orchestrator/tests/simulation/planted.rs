@@ -40,10 +40,12 @@ pub enum PlantedBug {
     KnownStructuresForgotten,
     /// After a restart the selector begins with the original mixture.
     MixtureForgotten,
+    /// Labellers are not told of the budget.
+    BudgetForgotten,
 }
 
 impl PlantedBug {
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 19] = [
         Self::AnswerBeforeCommit,
         Self::FailedCommitBelieved,
         Self::CommitRepeated,
@@ -62,12 +64,18 @@ impl PlantedBug {
         Self::QueueAbandoned,
         Self::KnownStructuresForgotten,
         Self::MixtureForgotten,
+        Self::BudgetForgotten,
     ];
 }
 
 impl PlantedBug {
-    /// A seed that found it, with which the search begins.
+    /// A seed that found it, with which the search begins: of bugs that the first seeds do not find.
     pub fn found_by(self) -> Option<u64> {
-        None
+        match self {
+            Self::IncarnationIgnored => Some(32),
+            Self::PauseRemembered => Some(50),
+            Self::CalculationRecordedLate => Some(57),
+            _ => None,
+        }
     }
 }

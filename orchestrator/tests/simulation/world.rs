@@ -8,7 +8,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use sqlx::SqliteConnection;
-use store::{ProcessRecord, Store};
+use store::{Budget, ProcessRecord, Store};
 
 use super::calculation::Calculation;
 use super::fault::{ClientKind, Direction, Fault, LinkTrouble, PlannedFault, Time};
@@ -149,6 +149,10 @@ impl World {
         let scenario = Scenario::of(seed);
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         let store = runtime.block_on(Store::open(directory)).unwrap();
+        if bug != Some(PlantedBug::BudgetForgotten) && scenario.label_budget.is_some() {
+            let budget = Budget { labels: scenario.label_budget, ..Budget::default() };
+            runtime.block_on(store.set_budget(&budget)).unwrap();
+        }
         let direct = runtime.block_on(super::invariants::connect(directory));
         let mut world = Self {
             now: 0,
@@ -198,9 +202,6 @@ impl World {
             (at, number, std::mem::discriminant(&event)).hash(&mut self.hasher);
             let changes = self.store.changes;
             self.handle(event);
-            for remark in std::mem::take(&mut self.store.remarks) {
-                self.tell(remark);
-            }
             if self.store.changes > changes {
                 self.check_store();
             }
@@ -253,6 +254,9 @@ impl World {
 
     /// Adds a sentence to the story.
     pub fn tell(&mut self, sentence: String) {
+        for remark in std::mem::take(&mut self.store.remarks) {
+            self.tell(remark);
+        }
         sentence.hash(&mut self.hasher);
         self.story.push(format!("{:8.3} s  {sentence}", self.now as f64 / 1000.0));
     }
