@@ -69,13 +69,27 @@ impl PlantedBug {
 }
 
 impl PlantedBug {
-    /// A seed that found it, with which the search begins: of bugs that the first seeds do not find.
-    pub fn found_by(self) -> Option<u64> {
+    /// A seed that finds it, with which the search begins.
+    pub fn found_by(self) -> u64 {
         match self {
-            Self::IncarnationIgnored => Some(32),
-            Self::PauseRemembered => Some(50),
-            Self::CalculationRecordedLate => Some(57),
-            _ => None,
+            Self::AnswerBeforeCommit
+            | Self::LeaseGivenTwice
+            | Self::CheckpointForgotten
+            | Self::TornMixture
+            | Self::QueueAbandoned
+            | Self::MixtureForgotten => 0,
+            Self::CalculationNotLookedUp | Self::ReplacedLabellerContinues => 1,
+            Self::FailedCommitBelieved
+            | Self::LostLeaseForgotten
+            | Self::LockIgnored
+            | Self::QueueLengthRemembered
+            | Self::KnownStructuresForgotten => 2,
+            Self::CommitRepeated => 4,
+            Self::FenceForgotten => 6,
+            Self::BudgetForgotten => 7,
+            Self::IncarnationIgnored => 32,
+            Self::PauseRemembered => 50,
+            Self::CalculationRecordedLate => 57,
         }
     }
 }

@@ -24,7 +24,7 @@ use super::walker::{WalkerKey, WalkerProcess};
 /// The wall clock at the start, ms since 1970.
 const WALL_CLOCK: i64 = 1_700_000_000_000;
 /// After the last fault, the campaign must end within this time.
-const TIME_TO_END: Time = 900_000;
+const TIME_TO_END: Time = 700_000;
 /// More events than any simulation has that makes progress.
 const MAX_EVENTS: usize = 40_000;
 /// Most events that may wait at a time.
