@@ -86,6 +86,8 @@ pub enum Fault {
     DropJob,
     /// A person requeues a job that failed or was dropped.
     RetryJob,
+    /// A person requests new labels for all labelled structures.
+    Relabel,
     /// A person pauses the walks, and resumes them.
     PauseWalks {
         until: Time,
@@ -161,7 +163,8 @@ impl Fault {
             19 => Self::KillCalculation,
             22 => Self::KillWalkerOften { walker, until: at + 11_000 },
             20 if random.happens(50) => Self::DropJob,
-            20 => Self::RetryJob,
+            20 if random.happens(50) => Self::RetryJob,
+            20 => Self::Relabel,
             _ => Self::PauseWalks { until },
         }
     }
@@ -264,6 +267,7 @@ impl fmt::Display for Fault {
             }
             Self::DropJob => f.write_str("a person drops a label job"),
             Self::RetryJob => f.write_str("a person requeues a label job"),
+            Self::Relabel => f.write_str("a person requests new labels"),
             Self::PauseWalks { until } => {
                 write!(f, "a person pauses all walks until {} s", seconds(until))
             }

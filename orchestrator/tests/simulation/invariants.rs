@@ -64,7 +64,7 @@ const MUST_BE_NONE: [(&str, &str); 12] = [
     ),
     (
         "jobs wait although they have a label",
-        "SELECT count(*) FROM job WHERE state IN ('queued', 'leased', 'failed') AND EXISTS (
+        "SELECT count(*) FROM job WHERE state IN ('queued', 'leased', 'failed') AND relabel IS NULL AND EXISTS (
             SELECT 1 FROM label WHERE label.structure = job.structure AND status = 'label')",
     ),
     (

@@ -8,13 +8,13 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use sqlx::SqliteConnection;
-use store::{Budget, ProcessRecord, Store};
+use store::{Budget, ProcessRecord, RelabelRequest, Store};
 
 use super::calculation::Calculation;
 use super::fault::{ClientKind, Direction, Fault, LinkTrouble, PlannedFault, Time};
 use super::faulty_store::FaultyStore;
 use super::invariants::Known;
-use super::labeller::Labeller;
+use super::labeller::{Labeller, PROTOCOL};
 use super::planted::PlantedBug;
 use super::random::Random;
 use super::run::Run;
@@ -378,6 +378,7 @@ impl World {
             Fault::ClockJump { milliseconds } => self.clock_offset += milliseconds,
             Fault::DropJob => self.drop_job(),
             Fault::RetryJob => self.retry_job(),
+            Fault::Relabel => self.relabel(),
             Fault::PauseWalks { until } => {
                 self.pause_walks(true);
                 self.at(until, Event::Resume);
@@ -448,6 +449,24 @@ impl World {
             store.retry_job(&name, now).await
         });
         self.tell(format!("job {} is requeued: {}", job.job, retried.is_ok()));
+    }
+
+    fn relabel(&mut self) {
+        let now = self.wall_clock();
+        let relabelled =
+            self.store.write(self.now, ClientKind::Labeller, "new labels are requested", async |store| {
+                let labelled = store.relabellable(PROTOCOL).await?;
+                let structures: Vec<_> = labelled.iter().map(|found| found.content).collect();
+                let request = RelabelRequest {
+                    structures: &structures,
+                    include_current: true,
+                    reason: "doubtful",
+                    protocol: None,
+                };
+                store.relabel(&request, now).await?;
+                Ok(structures.len())
+            });
+        self.tell(format!("new labels are requested: {relabelled:?}"));
     }
 
     /// A person tries again until it is done.
