@@ -44,8 +44,8 @@ fn directory() -> TempDir {
     if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() }.unwrap()
 }
 
-/// A new campaign, which each simulation copies.
-static NEW_CAMPAIGN: LazyLock<TempDir> = LazyLock::new(|| {
+/// The database of a new campaign, with which each simulation begins.
+static NEW_CAMPAIGN: LazyLock<Vec<u8>> = LazyLock::new(|| {
     let directory = directory();
     let campaign = CampaignRecord {
         id: CAMPAIGN,
@@ -71,7 +71,7 @@ static NEW_CAMPAIGN: LazyLock<TempDir> = LazyLock::new(|| {
         store.add_protocol(&protocol, 0).await.unwrap();
         store.close().await;
     });
-    directory
+    std::fs::read(directory.path().join(store::DATABASE)).unwrap()
 });
 
 /// The decision log of the undisturbed run of each reproducible scenario.
@@ -81,7 +81,7 @@ static UNDISTURBED: Mutex<BTreeMap<u64, String>> = Mutex::new(BTreeMap::new());
 fn simulate(seed: u64, faults: &[PlannedFault], bug: Option<PlantedBug>) -> Outcome {
     let directory = directory();
     let database = directory.path().join(store::DATABASE);
-    std::fs::copy(NEW_CAMPAIGN.path().join(store::DATABASE), &database).unwrap();
+    std::fs::write(&database, NEW_CAMPAIGN.as_slice()).unwrap();
     let mut outcome = World::new(seed, faults.to_vec(), bug, directory.path()).run();
     let scenario = Scenario::of(seed);
     if outcome.violation.is_none() && scenario.is_reproducible() && !(bug.is_none() && faults.is_empty()) {
