@@ -52,6 +52,11 @@ pub enum Fault {
         walker: u32,
         until: Time,
     },
+    /// Killed again and again, while its messages are late: those of dead processes arrive.
+    KillWalkerOften {
+        walker: u32,
+        until: Time,
+    },
     KillLabeller {
         labeller: u32,
         crash: bool,
@@ -81,6 +86,8 @@ pub enum Fault {
     DropJob,
     /// A person requeues a job that failed or was dropped.
     RetryJob,
+    /// A person requests new labels for all labelled structures.
+    Relabel,
     /// A person pauses the walks, and resumes them.
     PauseWalks {
         until: Time,
@@ -127,7 +134,7 @@ impl Fault {
         let labeller = random.below(scenario.labellers.into()) as u32;
         let until = at + random.between(2_000, LONGEST);
         let crash = random.happens(30);
-        match random.below(22) {
+        match random.below(23) {
             0..4 => {
                 let direction = [Direction::ToOrchestrator, Direction::ToWalker][random.below(2) as usize];
                 let troubles =
@@ -154,8 +161,10 @@ impl Fault {
                 Self::ClockJump { milliseconds: random.between(0, 7_200_000).cast_signed() - 3_600_000 }
             }
             19 => Self::KillCalculation,
+            22 => Self::KillWalkerOften { walker, until: at + 11_000 },
             20 if random.happens(50) => Self::DropJob,
-            20 => Self::RetryJob,
+            20 if random.happens(50) => Self::RetryJob,
+            20 => Self::Relabel,
             _ => Self::PauseWalks { until },
         }
     }
@@ -167,6 +176,7 @@ impl Fault {
             | Self::StoreAway { until }
             | Self::StoreFull { until }
             | Self::StopWalker { until, .. }
+            | Self::KillWalkerOften { until, .. }
             | Self::StopLabeller { until, .. }
             | Self::Hang { until }
             | Self::PauseWalks { until } => *until,
@@ -235,6 +245,13 @@ impl fmt::Display for Fault {
             Self::StopWalker { walker, until } => {
                 write!(f, "walker {walker} hangs until {} s", seconds(until))
             }
+            Self::KillWalkerOften { walker, until } => {
+                write!(
+                    f,
+                    "walker {walker} is killed again and again, with late messages, until {} s",
+                    seconds(until)
+                )
+            }
             Self::KillLabeller { labeller, crash: false } => write!(f, "labeller {labeller} is killed"),
             Self::KillLabeller { labeller, crash: true } => write!(f, "labeller {labeller} crashes"),
             Self::StopLabeller { labeller, until } => {
@@ -250,6 +267,7 @@ impl fmt::Display for Fault {
             }
             Self::DropJob => f.write_str("a person drops a label job"),
             Self::RetryJob => f.write_str("a person requeues a label job"),
+            Self::Relabel => f.write_str("a person requests new labels"),
             Self::PauseWalks { until } => {
                 write!(f, "a person pauses all walks until {} s", seconds(until))
             }

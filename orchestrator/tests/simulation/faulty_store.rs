@@ -5,9 +5,10 @@
 use std::collections::BTreeMap;
 use std::io;
 
-use store::records::Commit;
-use store::{Store, StoreError};
+use store::records::{Commit, Lease};
+use store::{CompleteOutcome, FailOutcome, Store, StoreError};
 use tokio::runtime::Runtime;
+use wire::WalkId;
 
 use super::fault::{ClientKind, Moment, Time};
 use super::planted::PlantedBug;
@@ -34,8 +35,8 @@ pub struct FaultyStore {
     pub generation: u64,
     /// Runs whose last commit was made, although its answer was lost.
     made: BTreeMap<u64, bool>,
-    /// Number of writes that reached the database.
-    pub writes: u64,
+    /// Number of writes that changed something.
+    pub changes: u64,
     /// Whether the last write that failed was made all the same.
     failed_but_made: bool,
     /// What the story tells.
@@ -43,6 +44,40 @@ pub struct FaultyStore {
     /// A replaced orchestrator has written.
     pub fence_broken: bool,
 }
+
+/// The answer to a write.
+pub trait WriteAnswer {
+    /// Whether something may have changed that invariants are about.
+    fn has_changed(&self) -> bool {
+        true
+    }
+}
+
+impl WriteAnswer for usize {
+    fn has_changed(&self) -> bool {
+        *self > 0
+    }
+}
+
+impl WriteAnswer for Option<Lease> {
+    fn has_changed(&self) -> bool {
+        self.is_some()
+    }
+}
+
+/// Records of processes are no matter of invariants.
+impl WriteAnswer for () {
+    fn has_changed(&self) -> bool {
+        false
+    }
+}
+
+impl WriteAnswer for std::ops::Range<i64> {}
+impl WriteAnswer for bool {}
+impl WriteAnswer for String {}
+impl WriteAnswer for Vec<WalkId> {}
+impl WriteAnswer for CompleteOutcome {}
+impl WriteAnswer for FailOutcome {}
 
 fn unreachable(what: &str) -> StoreError {
     StoreError::Unreachable(sqlx::Error::Io(io::Error::new(io::ErrorKind::ConnectionReset, what.to_owned())))
@@ -60,7 +95,7 @@ impl FaultyStore {
             next_writes: Vec::new(),
             generation: 0,
             made: BTreeMap::new(),
-            writes: 0,
+            changes: 0,
             failed_but_made: false,
             remarks: Vec::new(),
             fence_broken: false,
@@ -85,7 +120,7 @@ impl FaultyStore {
     }
 
     /// Writes.
-    pub fn write<T>(
+    pub fn write<T: WriteAnswer>(
         &mut self,
         now: Time,
         client: ClientKind,
@@ -105,8 +140,8 @@ impl FaultyStore {
                 Err(self.refusal())
             }
             fault => {
-                self.writes += 1;
                 let written = self.runtime.block_on(write(&self.store));
+                self.changes += u64::from(written.as_ref().is_ok_and(WriteAnswer::has_changed));
                 if fault.is_none() {
                     return written;
                 }

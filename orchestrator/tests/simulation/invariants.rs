@@ -1,7 +1,8 @@
 //! What must hold after every event, and at the end.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::Path;
+use std::sync::LazyLock;
 
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{ConnectOptions, SqliteConnection};
@@ -19,8 +20,8 @@ pub struct Known {
     pub accepted: BTreeSet<String>,
     /// Offers that arrived: the process and the number.
     pub offers: BTreeSet<(WalkerKey, u64)>,
-    /// Assignments of each walk, labels, and decisions: none of them ever becomes less.
-    numbers: BTreeMap<String, i64>,
+    /// The answer to [`GROWING`].
+    numbers: Vec<i64>,
 }
 
 /// Questions whose answer is 0, and what it means if not.
@@ -63,7 +64,7 @@ const MUST_BE_NONE: [(&str, &str); 12] = [
     ),
     (
         "jobs wait although they have a label",
-        "SELECT count(*) FROM job WHERE state IN ('queued', 'leased', 'failed') AND EXISTS (
+        "SELECT count(*) FROM job WHERE state IN ('queued', 'leased', 'failed') AND relabel IS NULL AND EXISTS (
             SELECT 1 FROM label WHERE label.structure = job.structure AND status = 'label')",
     ),
     (
@@ -79,12 +80,18 @@ const MUST_BE_NONE: [(&str, &str); 12] = [
     ),
 ];
 
-/// Numbers that never become less.
-const GROWING: &str = "SELECT 'decisions', count(*) FROM decision
-    UNION ALL SELECT 'labels', count(*) FROM label
-    UNION ALL SELECT 'accepted candidates', count(*) FROM candidate WHERE fate = 'accepted'
-    UNION ALL SELECT 'assignments of walk ' || walk, assignments FROM walk
-    UNION ALL SELECT 'attempts at job ' || number, attempts FROM job";
+/// Numbers that never become less: of decisions, labels, accepted candidates, assignments and attempts.
+const GROWING: &str = "SELECT
+    (SELECT count(*) FROM decision) || ',' || (SELECT count(*) FROM label) || ',' ||
+    (SELECT count(*) FROM candidate WHERE fate = 'accepted') || ',' ||
+    coalesce((SELECT group_concat(assignments) FROM (SELECT assignments FROM walk ORDER BY walk)), '') || ',' ||
+    (SELECT count(*) FROM attempt)";
+
+/// Both as one question.
+static QUESTIONS: LazyLock<String> = LazyLock::new(|| {
+    let all = MUST_BE_NONE.map(|(_, question)| format!("({question})"));
+    format!("SELECT {}, ({GROWING})", all.join(" || ',' || "))
+});
 
 /// A connection to the database of a campaign, besides those of the store.
 pub async fn connect(directory: &Path) -> SqliteConnection {
@@ -100,25 +107,33 @@ impl World {
         if self.store.fence_broken {
             return self.fail("an orchestrator that was replaced has written".to_owned());
         }
-        let all: Vec<String> = MUST_BE_NONE.iter().map(|(_, question)| format!("({question})")).collect();
-        let sql = format!("SELECT {}", all.join(" || ',' || "));
-        let broken: (String,) = self.ask(&sql);
-        let broken = broken.0.split(',').zip(MUST_BE_NONE).find(|(count, _)| *count != "0");
+        let (answers, numbers): (String, String) = self.ask(&QUESTIONS);
+        let broken = answers.split(',').zip(MUST_BE_NONE).find(|(count, _)| *count != "0");
         if let Some((count, (what, _))) = broken {
             return self.fail(format!("{what} ({count})"));
         }
-        let numbers: Vec<(String, i64)> =
-            self.store.runtime.block_on(sqlx::query_as(GROWING).fetch_all(&mut self.direct)).unwrap();
-        for (what, number) in numbers {
-            let before = self.known.numbers.insert(what.clone(), number).unwrap_or(0);
-            if number < before {
-                return self.fail(format!("{what}: {number}, and {before} before"));
-            }
+        let numbers: Vec<i64> = numbers.split(',').filter_map(|number| number.parse().ok()).collect();
+        // Walks begin only once, so the numbers have fixed places.
+        let before = std::mem::replace(&mut self.known.numbers, numbers.clone());
+        if before.len() == numbers.len()
+            && before.iter().zip(&numbers).any(|(before, number)| number < before)
+        {
+            return self.fail(format!(
+                "decisions, labels, assignments or attempts are gone: {before:?}, then {numbers:?}"
+            ));
         }
-        let (decisions, accepted) =
-            (self.known.numbers["decisions"], self.known.numbers["accepted candidates"]);
-        if decisions < self.known.decisions || accepted < self.known.accepted.len() as i64 {
+        if numbers[0] < self.known.decisions || numbers[2] < self.known.accepted.len() as i64 {
             self.fail("an acknowledged commit is not in the store".to_owned());
+        }
+    }
+
+    /// Labels exceed their budget by no more than what was under way when it was used up.
+    fn check_budget(&mut self) {
+        let Some(budget) = self.scenario.label_budget else { return };
+        let (labels,): (i64,) = self.ask("SELECT count(*) FROM label WHERE status = 'label'");
+        let limit = budget + u64::from(self.scenario.labellers);
+        if labels.cast_unsigned() > limit {
+            self.fail(format!("there are {labels} labels, with a budget of {budget}"));
         }
     }
 
@@ -148,7 +163,9 @@ impl World {
         self.check_store();
         let (waiting,): (i64,) = self.ask("SELECT count(*) FROM job WHERE state IN ('queued', 'leased')");
         let (walks,): (i64,) = self.ask("SELECT count(*) FROM walk WHERE state IN ('waiting', 'running')");
-        if waiting > 0 || walks > 0 {
+        let is_used_up = self.scenario.label_budget.is_some();
+        self.check_budget();
+        if waiting > 0 && !is_used_up || walks > 0 {
             self.fail(format!("the campaign has ended with {waiting} unfinished jobs and {walks} walks"));
         }
         let missing: Vec<String> = self

@@ -16,8 +16,8 @@ pub const PROTOCOL: ContentHash = ContentHash([7; 32]);
 pub const ATTEMPTS: u32 = 3;
 /// Duration of a lease, s; it is renewed every third of it.
 const LEASE: u32 = 30;
-const HEARTBEAT_INTERVAL: Time = 10_000;
-const POLL_INTERVAL: Time = 4_000;
+const HEARTBEAT_INTERVAL: Time = 15_000;
+const POLL_INTERVAL: Time = 6_000;
 /// Time between two tries of a write while the database is busy or the disk full.
 const RETRY_INTERVAL: Time = 1_000;
 /// A replaced labeller may begin no label so long after its successor started.

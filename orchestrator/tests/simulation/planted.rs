@@ -40,10 +40,12 @@ pub enum PlantedBug {
     KnownStructuresForgotten,
     /// After a restart the selector begins with the original mixture.
     MixtureForgotten,
+    /// Labellers are not told of the budget.
+    BudgetForgotten,
 }
 
 impl PlantedBug {
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 19] = [
         Self::AnswerBeforeCommit,
         Self::FailedCommitBelieved,
         Self::CommitRepeated,
@@ -62,12 +64,32 @@ impl PlantedBug {
         Self::QueueAbandoned,
         Self::KnownStructuresForgotten,
         Self::MixtureForgotten,
+        Self::BudgetForgotten,
     ];
 }
 
 impl PlantedBug {
-    /// A seed that found it, with which the search begins.
-    pub fn found_by(self) -> Option<u64> {
-        None
+    /// A seed that finds it, with which the search begins.
+    pub fn found_by(self) -> u64 {
+        match self {
+            Self::AnswerBeforeCommit
+            | Self::LeaseGivenTwice
+            | Self::CheckpointForgotten
+            | Self::TornMixture
+            | Self::QueueAbandoned
+            | Self::MixtureForgotten => 0,
+            Self::CalculationNotLookedUp | Self::ReplacedLabellerContinues => 1,
+            Self::FailedCommitBelieved
+            | Self::LostLeaseForgotten
+            | Self::LockIgnored
+            | Self::QueueLengthRemembered
+            | Self::KnownStructuresForgotten => 2,
+            Self::CommitRepeated => 4,
+            Self::FenceForgotten => 6,
+            Self::BudgetForgotten => 7,
+            Self::IncarnationIgnored => 32,
+            Self::PauseRemembered => 50,
+            Self::CalculationRecordedLate => 57,
+        }
     }
 }

@@ -25,13 +25,13 @@ use super::world::{Event, Exit, World};
 use crate::common::restore;
 
 /// Time between two heartbeats of a run.
-const HEARTBEAT_INTERVAL: Time = 10_000;
+const HEARTBEAT_INTERVAL: Time = 15_000;
 /// Time between two looks at what has changed in the store while walkers wait.
-const TICK: Time = 2_000;
+const TICK: Time = 4_000;
 /// Most messages of walkers that may wait for the reactor: an offer and an exit of each, and some progress.
 const MAX_INCOMING: usize = 64 + 2 * 8;
 const LIMITS: Limits = Limits {
-    heartbeat_timeout: Duration::from_secs(30),
+    heartbeat_timeout: Duration::from_secs(40),
     initial_backoff: Duration::from_secs(1),
     max_backoff: Duration::from_secs(20),
     max_restarts: 5,

@@ -22,6 +22,8 @@ pub struct Scenario {
     pub labellers: u32,
     /// Walkers wait while more label jobs are unfinished.
     pub queue_limit: u64,
+    /// Number of labels that the campaign may make.
+    pub label_budget: Option<u64>,
     /// Whether the database is a server: connections break, locks are lost, and a commit is looked up by its mark.
     pub server: bool,
 }
@@ -38,13 +40,16 @@ impl Scenario {
             walks_per_round: 1 + random.below(3) as usize,
             ..settings(mode)
         };
+        let label_budget = (number % 4 == 3).then_some(5);
         Self {
             number,
             settings,
             scripts: (0..SEED_STRUCTURES).map(|_| script(&mut random)).collect(),
             walkers: random.between(2, 4) as u32,
             labellers: random.between(1, 2) as u32,
-            queue_limit: if random.happens(50) { 3 } else { 1000 },
+            // A used-up budget ends a run in earnest; here the queue stays.
+            queue_limit: if label_budget.is_none() && random.happens(60) { 3 } else { 1000 },
+            label_budget,
             server: number % 8 >= 4,
         }
     }
@@ -68,5 +73,5 @@ fn script(random: &mut Random) -> Script {
             Event::Structure { number: random.below(12), z, close: kind == 16 }
         }
     };
-    (0..32).map(&mut event).collect()
+    (0..24).map(&mut event).collect()
 }

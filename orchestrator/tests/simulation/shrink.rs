@@ -4,8 +4,8 @@ use super::fault::PlannedFault;
 use super::planted::PlantedBug;
 use super::simulate;
 
-/// Longest story, in lines.
-const MAX_LINES: usize = 120;
+/// Longest story, in lines: the beginning and the end of a longer one.
+const MAX_LINES: usize = 160;
 
 /// Drops faults one after the other while the simulation still breaks an invariant.
 fn shrink(seed: u64, faults: &[PlannedFault], bug: Option<PlantedBug>) -> Vec<PlannedFault> {
@@ -27,21 +27,22 @@ fn shrink(seed: u64, faults: &[PlannedFault], bug: Option<PlantedBug>) -> Vec<Pl
 pub fn story_of_failure(seed: u64, faults: &[PlannedFault], bug: Option<PlantedBug>) -> String {
     let left = shrink(seed, faults, bug);
     let outcome = simulate(seed, &left, bug);
-    let plural = if left.len() == 1 { "fault" } else { "faults" };
     let mut story = vec![format!(
-        "seed {seed}, with {} of {} faults ({} {plural}): {}",
+        "seed {seed}, {} of its {} faults suffice: {}",
         left.len(),
         faults.len(),
-        left.len(),
         outcome.violation.unwrap_or_default()
     )];
     story.extend(
         left.iter().map(|planned| format!("fault at {} s: {}", planned.at as f64 / 1000.0, planned.fault)),
     );
-    let skipped = outcome.story.len().saturating_sub(MAX_LINES);
+    let told = outcome.story;
+    let skipped = told.len().saturating_sub(MAX_LINES);
+    let (begin, end) = told.split_at(told.len().min(MAX_LINES / 2));
+    story.extend_from_slice(begin);
     if skipped > 0 {
-        story.push(format!("(without the last {skipped} lines)"));
+        story.push(format!("… {skipped} lines …"));
     }
-    story.extend(outcome.story.into_iter().take(MAX_LINES));
+    story.extend_from_slice(&end[skipped..]);
     story.join("\n")
 }

@@ -13,8 +13,8 @@ use super::world::{Event, Exit, World};
 use crate::common::scripted::advance;
 use crate::common::seed_structure;
 
-/// Time between two questions about an offer, as in `wire::ipc`.
-const POLL_INTERVAL: Time = 2_000;
+/// Time between two questions about an offer.
+const POLL_INTERVAL: Time = 5_000;
 /// How long a walker waits for its orchestrator.
 const ANSWER_TIMEOUT: Time = 600_000;
 /// The same after it was asked to stop.

@@ -8,13 +8,13 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use sqlx::SqliteConnection;
-use store::{ProcessRecord, Store};
+use store::{Budget, ProcessRecord, RelabelRequest, Store};
 
 use super::calculation::Calculation;
 use super::fault::{ClientKind, Direction, Fault, LinkTrouble, PlannedFault, Time};
 use super::faulty_store::FaultyStore;
 use super::invariants::Known;
-use super::labeller::Labeller;
+use super::labeller::{Labeller, PROTOCOL};
 use super::planted::PlantedBug;
 use super::random::Random;
 use super::run::Run;
@@ -24,7 +24,7 @@ use super::walker::{WalkerKey, WalkerProcess};
 /// The wall clock at the start, ms since 1970.
 const WALL_CLOCK: i64 = 1_700_000_000_000;
 /// After the last fault, the campaign must end within this time.
-const TIME_TO_END: Time = 900_000;
+const TIME_TO_END: Time = 700_000;
 /// More events than any simulation has that makes progress.
 const MAX_EVENTS: usize = 40_000;
 /// Most events that may wait at a time.
@@ -38,6 +38,8 @@ pub enum Event {
     Fault(usize),
     /// The end of a pause of all walks.
     Resume,
+    /// A walker is killed, and again until this time.
+    KillAgain(u32, Time),
     StartRun,
     /// A message arrives at the server of a run.
     ToServer {
@@ -147,6 +149,10 @@ impl World {
         let scenario = Scenario::of(seed);
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         let store = runtime.block_on(Store::open(directory)).unwrap();
+        if bug != Some(PlantedBug::BudgetForgotten) && scenario.label_budget.is_some() {
+            let budget = Budget { labels: scenario.label_budget, ..Budget::default() };
+            runtime.block_on(store.set_budget(&budget)).unwrap();
+        }
         let direct = runtime.block_on(super::invariants::connect(directory));
         let mut world = Self {
             now: 0,
@@ -194,12 +200,9 @@ impl World {
             self.now = at;
             events += 1;
             (at, number, std::mem::discriminant(&event)).hash(&mut self.hasher);
-            let writes = self.store.writes;
+            let changes = self.store.changes;
             self.handle(event);
-            for remark in std::mem::take(&mut self.store.remarks) {
-                self.tell(remark);
-            }
-            if self.store.writes > writes {
+            if self.store.changes > changes {
                 self.check_store();
             }
             self.check_memory();
@@ -251,6 +254,9 @@ impl World {
 
     /// Adds a sentence to the story.
     pub fn tell(&mut self, sentence: String) {
+        for remark in std::mem::take(&mut self.store.remarks) {
+            self.tell(remark);
+        }
         sentence.hash(&mut self.hasher);
         self.story.push(format!("{:8.3} s  {sentence}", self.now as f64 / 1000.0));
     }
@@ -293,6 +299,7 @@ impl World {
         match event {
             Event::Fault(number) => self.begin_fault(self.plan[number].fault.clone()),
             Event::Resume => self.pause_walks(false),
+            Event::KillAgain(walker, until) => self.kill_walker_again(walker, until),
             Event::StartRun => self.start_run(),
             Event::ToServer { from, sequence, bytes } => self.message_arrives(from, sequence, bytes),
             Event::ToWalker { to, bytes } => self.answer_arrives(to, bytes),
@@ -337,6 +344,10 @@ impl World {
                     process.stopped_until = until;
                 }
             }
+            Fault::KillWalkerOften { walker, until } => {
+                self.links.push((walker, Direction::ToOrchestrator, LinkTrouble::Delay, until));
+                self.kill_walker_again(walker, until);
+            }
             Fault::KillLabeller { labeller, crash } => {
                 if let Some(id) = self.newest_labeller(labeller) {
                     self.labeller_exits(id, if crash { Exit::Crash } else { Exit::Killed });
@@ -367,11 +378,22 @@ impl World {
             Fault::ClockJump { milliseconds } => self.clock_offset += milliseconds,
             Fault::DropJob => self.drop_job(),
             Fault::RetryJob => self.retry_job(),
+            Fault::Relabel => self.relabel(),
             Fault::PauseWalks { until } => {
                 self.pause_walks(true);
                 self.at(until, Event::Resume);
             }
             Fault::KillCalculation => self.kill_calculation(),
+        }
+    }
+
+    fn kill_walker_again(&mut self, walker: u32, until: Time) {
+        if let Some(key) = self.leader().and_then(|run| self.newest_walker(run, walker)) {
+            self.walker_exits(key, Exit::Killed);
+        }
+        let delay = self.random.between(1_500, 3_500);
+        if self.now + delay < until {
+            self.after(delay, Event::KillAgain(walker, until));
         }
     }
 
@@ -427,6 +449,24 @@ impl World {
             store.retry_job(&name, now).await
         });
         self.tell(format!("job {} is requeued: {}", job.job, retried.is_ok()));
+    }
+
+    fn relabel(&mut self) {
+        let now = self.wall_clock();
+        let relabelled =
+            self.store.write(self.now, ClientKind::Labeller, "new labels are requested", async |store| {
+                let labelled = store.relabellable(PROTOCOL).await?;
+                let structures: Vec<_> = labelled.iter().map(|found| found.content).collect();
+                let request = RelabelRequest {
+                    structures: &structures,
+                    include_current: true,
+                    reason: "doubtful",
+                    protocol: None,
+                };
+                store.relabel(&request, now).await?;
+                Ok(structures.len())
+            });
+        self.tell(format!("new labels are requested: {relabelled:?}"));
     }
 
     /// A person tries again until it is done.
