@@ -44,10 +44,10 @@ pub fn learning_curves(history: &[EpochRecord]) -> Figure {
     for ((panel, area), letter) in panels.into_iter().zip(areas).zip('a'..) {
         panel.draw(&mut figure, area, letter, history.len());
     }
-    let keys = [
-        (LegendKey::Line(TRAINING.line(1.2)), "training, during the epoch"),
-        (LegendKey::Line(VALIDATION.line(1.2)), "validation, after it"),
-    ];
+    let mut keys = vec![(LegendKey::Line(TRAINING.line(1.2)), "training, during the epoch")];
+    if history.iter().any(|record| record.errors.validation.is_some()) {
+        keys.push((LegendKey::Line(VALIDATION.line(1.2)), "validation, after it"));
+    }
     legend(&mut figure, [WIDTH - 8.0, 12.0], &keys);
     figure
 }
@@ -135,6 +135,13 @@ mod tests {
                 assert!(svg.contains(expected) && !svg.contains("NaN"), "{svg}");
             }
         }
+    }
+
+    #[test]
+    fn the_legend_has_validation_only_if_there_is_any() {
+        let svg = |validation| to_svg(&learning_curves(&[record(1, validation)]));
+        assert!(svg(Some(errors(2.0, None))).contains("validation"));
+        assert!(!svg(None).contains("validation"));
     }
 
     #[test]
