@@ -83,7 +83,8 @@ mod tests {
             ("3.2 min/10 min".into(), "1.0 s".into())
         );
         let jobs = [("abinit".into(), JobState::Labelled, 7), ("abinit".into(), JobState::Queued, 2)];
-        let shown = line(&vec![progress(None); 5], &jobs, 1000);
+        let five: [LabelUnderWay; 5] = std::array::from_fn(|_| progress(None));
+        let shown = line(&five, &jobs, 1000);
         assert!(
             shown.starts_with("labels: 7 made, 2 queued, 5 under way (Si8 by abinit: 1.0 s; "),
             "{shown}"
