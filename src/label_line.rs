@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::ProgressBar;
 
-use crate::output::print_stderr;
+use crate::output::print_progress;
 
 /// Interval between plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(60);
@@ -39,7 +39,7 @@ impl LabelLine {
             bar.set_message(line.to_owned());
         } else if !line.is_empty() && shown.last_line.elapsed() > LINE_INTERVAL {
             shown.last_line = Instant::now();
-            print_stderr(line);
+            print_progress(line);
         }
     }
 }

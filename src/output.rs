@@ -2,6 +2,7 @@
 
 use std::fmt::Display;
 use std::io::{self, BufWriter, ErrorKind, IsTerminal, Write};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -25,15 +26,35 @@ pub fn print(write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(),
     }
 }
 
+/// Whether only results, warnings and errors are printed.
+static QUIET: AtomicBool = AtomicBool::new(false);
+
+/// From now on, prints results, warnings and errors only.
+pub fn set_quiet() {
+    QUIET.store(true, Ordering::Relaxed);
+}
+
+/// Whether progress is not printed.
+pub fn is_quiet() -> bool {
+    QUIET.load(Ordering::Relaxed)
+}
+
+/// Prints a line about progress to standard error, unless that is not wanted.
+pub fn print_progress(line: impl Display) {
+    if !is_quiet() {
+        print_stderr(line);
+    }
+}
+
 /// Prints a line to standard error. Ignores errors, which must not stop any work.
 pub fn print_stderr(line: impl Display) {
     let _ = writeln!(io::stderr().lock(), "{line}");
 }
 
-/// Prints a line to standard error and logs it.
+/// Prints a line to standard error, unless only warnings are wanted, and logs it.
 pub fn log_and_print(line: impl Display) {
     tracing::info!("{line}");
-    print_stderr(line);
+    print_progress(line);
 }
 
 /// Prints a warning to standard error and logs it.
@@ -119,6 +140,23 @@ impl TextTable {
         self.rows.push(row);
     }
 
+    /// Removes columns without any value.
+    pub fn drop_unknown(&mut self) {
+        let is_known = |column: usize| {
+            self.rows
+                .iter()
+                .skip(1)
+                .any(|row| row.get(column).is_none_or(|cell| !cell.is_empty() && cell != "–"))
+        };
+        let kept: Vec<bool> = (0..self.columns.len()).map(is_known).collect();
+        let mut place = kept.iter();
+        self.columns.retain(|_| place.next() == Some(&true));
+        for row in &mut self.rows {
+            let mut place = kept.iter();
+            row.retain(|_| place.next() == Some(&true));
+        }
+    }
+
     /// Writes all rows.
     pub fn write(&self, out: &mut dyn Write) -> io::Result<()> {
         self.lines().try_for_each(|line| writeln!(out, "{line}"))
@@ -154,7 +192,7 @@ impl Bar {
 
     /// Whether standard error is a terminal.
     pub fn is_shown(&self) -> bool {
-        io::stderr().is_terminal()
+        io::stderr().is_terminal() && !is_quiet()
     }
 
     /// Sets a length that was not known at first.
@@ -169,7 +207,7 @@ impl Bar {
 
     /// Moves the bar.
     pub fn set(&self, position: u64, message: impl FnOnce() -> String) {
-        if self.bar.is_hidden() && self.begun.elapsed() > BAR_AFTER {
+        if self.bar.is_hidden() && self.begun.elapsed() > BAR_AFTER && !is_quiet() {
             self.bar.set_draw_target(ProgressDrawTarget::stderr());
         }
         if !self.bar.is_hidden() {
@@ -193,6 +231,15 @@ mod tests {
     fn four_digits_are_enough() {
         let shown = [2389.227, 41.3333, 1.5, 0.000_123_4].map(|x| four_digits(x, 4));
         assert_eq!(shown, ["2389", "41.33", "1.500", "0.0001"]);
+    }
+
+    #[test]
+    fn columns_without_values_are_dropped() {
+        let mut table = TextTable::new(&["name", ">steps/s", ">step"]);
+        table.push(vec!["fcc".into(), "–".into(), "5".into()]);
+        table.push(vec!["bcc".into(), "–".into(), "–".into()]);
+        table.drop_unknown();
+        assert_eq!(table.lines().collect::<Vec<_>>(), ["name  step", "fcc      5", "bcc      –"]);
     }
 
     #[test]

@@ -14,7 +14,7 @@ use wire::{Origin, WalkId};
 
 use crate::forgetting::{AlarmState, ForgettingMeasurement, ForgettingRule};
 use crate::label_line::LabelLine;
-use crate::output::{count, decimals, print_stderr};
+use crate::output::{count, decimals, is_quiet, print_progress, print_stderr};
 use crate::wording::walk_ends;
 
 /// Interval between plain lines that only report steps.
@@ -70,7 +70,7 @@ impl RunDisplay {
             names.insert(walk, name);
             steps.set(walk, step);
         }
-        let bars = std::io::stderr().is_terminal().then(Bars::new);
+        let bars = (std::io::stderr().is_terminal() && !is_quiet()).then(Bars::new);
         labels.set_bar(bars.as_ref().map(|bars| bars.labels.clone()));
         let mut display = Self {
             bars,
@@ -178,7 +178,7 @@ impl RunDisplay {
             self.warned = true;
             let warning = format!("WARNING: {}", walk_ends::warning(&self.ends));
             tracing::warn!("{warning}");
-            self.show(&warning);
+            self.show_lasting(&warning);
         }
     }
 
@@ -198,7 +198,7 @@ impl RunDisplay {
     fn show(&self, line: &str) {
         match &self.bars {
             Some(bars) => bars.message.set_message(line.to_owned()),
-            None => print_stderr(line),
+            None => print_progress(line),
         }
     }
 
@@ -219,7 +219,7 @@ impl RunDisplay {
             bars.steps.set_message(format!("{} accepted", self.accepted));
         } else if self.last_line.elapsed() > LINE_INTERVAL {
             self.last_line = Instant::now();
-            print_stderr(format_args!("{done} of {all} steps, {} accepted in this run", self.accepted));
+            print_progress(format_args!("{done} of {all} steps, {} accepted in this run", self.accepted));
         }
     }
 }

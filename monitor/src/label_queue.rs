@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 use store::{CampaignStatus, FailureCount, JobState, Store, StoreError, Unlabelled};
 
 use crate::label_cost::{self, CostEstimator, QueueCost};
-use crate::label_progress::{self, LabelProgress};
+use crate::label_progress::{self, LabelUnderWay};
 use crate::versions::newest_with_labels;
 
 /// Largest number of labelled structures for which ranges of grades and volumes are computed.
@@ -22,7 +22,7 @@ pub struct LabelQueue {
     /// The label jobs of each protocol.
     pub by_protocol: Vec<ProtocolJobs>,
     /// Labels that are being made, the longest first; at most [`label_progress::MAX_RUNNING`].
-    pub running: Vec<LabelProgress>,
+    pub running: Vec<LabelUnderWay>,
     /// Structures found by both biased and control walks, with one label each; not counted in large campaigns.
     pub shared: Option<u64>,
 }

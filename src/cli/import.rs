@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use atoms::{FileError, Structure};
+use serde_json::json;
 use store::records::{Label, Protocol};
 use store::{CampaignLock, ImportCounts, QueuedImports, Store, unix_milliseconds};
 use wire::ContentHash;
@@ -10,7 +11,7 @@ use workers::labeller::LabelBounds;
 
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::label_setup;
-use crate::output::{count, print};
+use crate::output::{count, print, print_json};
 use crate::xyz_reader::{XyzReader, label};
 
 /// Import labelled structures, or structures for labelling
@@ -40,6 +41,12 @@ pub struct ImportArgs {
     /// Priority in the queue; higher values are labelled first. Candidates have 10, control frames 0
     #[arg(long, value_name = "N", requires = "queue", default_value_t = 0, allow_negative_numbers = true)]
     priority: i32,
+    /// Read and check the files without importing anything
+    #[arg(long)]
+    dry_run: bool,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
 }
 
 /// The frames of one file with their numbers in it.
@@ -71,20 +78,58 @@ impl ImportArgs {
         if self.queue {
             let structures: Vec<_> =
                 self.files.iter().map(|path| read_unlabelled(path)).collect::<Result<_, _>>()?;
-            let QueuedImports { queued, known } = block_on(self.queue_structures(&structures.concat()))??;
+            let structures = structures.concat();
+            if self.dry_run {
+                return self.print_dry_run(structures.len());
+            }
+            let QueuedImports { queued, known } = block_on(self.queue_structures(&structures))??;
+            if self.json {
+                print_json(&json!({ "queued": queued, "known": known, "dry_run": false }))?;
+                return Ok(ExitStatus::Done);
+            }
             print(|out| {
                 writeln!(out, "queued {} for labelling; {known} already known", count(queued, "structure"))
             })?;
             return Ok(ExitStatus::Done);
         }
         let files: Vec<_> = self.files.iter().map(|path| read(path)).collect::<Result<_, _>>()?;
+        if self.dry_run {
+            block_on(self.check(&files))??;
+            return self.print_dry_run(files.iter().map(|file| file.frames.len()).sum());
+        }
         let (protocol, imported) = block_on(self.import(&files))??;
         let ImportCounts { labels, checks, known } = imported;
+        if self.json {
+            let name = &protocol.name;
+            print_json(
+                &json!({ "labels": labels, "checks": checks, "known": known, "protocol": name, "dry_run": false }),
+            )?;
+            return Ok(ExitStatus::Done);
+        }
         print(|out| {
             let name = &protocol.name;
             let (labels, checks) = (count(labels, "label"), count(checks, "check"));
             writeln!(out, "imported {labels} and {checks} of protocol '{name}'; {known} already known")
         })?;
+        Ok(ExitStatus::Done)
+    }
+
+    /// Applies the campaign's bounds for its own labels, and changes nothing.
+    async fn check(&self, files: &[ImportedFile]) -> Result<(), CommandError> {
+        let store = Store::open_read_only(&self.location.get()?).await?;
+        let bounds = label_setup::read_bounds(&store).await?;
+        store.close().await;
+        files.iter().try_for_each(|file| file.check(&bounds))
+    }
+
+    fn print_dry_run(&self, frames: usize) -> Result<ExitStatus, CommandError> {
+        if self.json {
+            print_json(&json!({ "frames": frames, "dry_run": true }))?;
+        } else {
+            print(|out| {
+                writeln!(out, "{} can be imported; nothing was changed", count(frames as u64, "frame"))
+            })?;
+        }
         Ok(ExitStatus::Done)
     }
 

@@ -58,6 +58,9 @@ use crate::exit_status::{CommandError, ExitStatus};
 #[derive(Debug, Parser)]
 #[command(name = "calmwalk", version, long_version = build_info::long_version(), max_term_width = 100)]
 pub struct Arguments {
+    /// Print results, warnings and errors only, no progress
+    #[arg(long, global = true)]
+    quiet: bool,
     #[command(subcommand)]
     command: CliCommand,
 }
@@ -113,6 +116,9 @@ enum CliCommand {
 
 /// Runs the command.
 pub fn run(arguments: Arguments) -> Result<ExitStatus, CommandError> {
+    if arguments.quiet {
+        crate::output::set_quiet();
+    }
     match arguments.command {
         CliCommand::Init(command) => command.run(),
         CliCommand::Validate(command) => command.run(),

@@ -27,6 +27,9 @@ pub struct QueueArgs {
     /// Print JSON
     #[arg(long, global = true)]
     json: bool,
+    /// With drop, retry and prioritise: print which jobs would change without changing them
+    #[arg(long, global = true)]
+    dry_run: bool,
 }
 
 #[derive(Clone, Debug, PartialEq, clap::Subcommand)]
@@ -131,11 +134,21 @@ impl QueueArgs {
     /// Changes one job after the other, and prints the new state of each.
     fn change(&self, location: &Location, action: &QueueCommand) -> Result<(), CommandError> {
         let mut changed = Vec::new();
-        let result = block_on(change(location, action, &mut changed))?;
+        let result = match self.dry_run {
+            true => block_on(find_jobs(location, action, &mut changed))?,
+            false => block_on(change(location, action, &mut changed))?,
+        };
         if self.json {
             print_json(&changed)?;
         } else {
-            print(|out| changed.iter().try_for_each(|job| writeln!(out, "{}", message(action, job))))?;
+            let text = |job: &QueueEntry| match self.dry_run {
+                true => format!(
+                    "{} is {}, priority {}; nothing was changed",
+                    job.candidate, job.state, job.priority
+                ),
+                false => message(action, job),
+            };
+            print(|out| changed.iter().try_for_each(|job| writeln!(out, "{}", text(job))))?;
         }
         result
     }
@@ -153,6 +166,33 @@ async fn read_list(
 async fn read_details(location: &Location, id: &str) -> Result<JobDetails, CommandError> {
     let store = Store::open_read_only(location).await?;
     Ok(store.queue_show(id).await?)
+}
+
+/// Finds the jobs that `action` would change.
+async fn find_jobs(
+    location: &Location,
+    action: &QueueCommand,
+    found: &mut Vec<QueueEntry>,
+) -> Result<(), CommandError> {
+    let store = Store::open_read_only(location).await?;
+    let ids = match action {
+        QueueCommand::Drop { ids } | QueueCommand::Retry { ids } => ids.as_slice(),
+        QueueCommand::Prioritise { id, .. } => std::slice::from_ref(id),
+        _ => &[],
+    };
+    for id in ids {
+        let job = store.queue_show(id).await?.job;
+        let fits = match action {
+            QueueCommand::Retry { .. } => matches!(job.state, JobState::Failed | JobState::Dropped),
+            _ => !matches!(job.state, JobState::Labelled | JobState::Superseded),
+        };
+        if !fits {
+            return Err(CommandError::Input(format!("{} is {}", job.candidate, job.state)));
+        }
+        found.push(job);
+    }
+    store.close().await;
+    Ok(())
 }
 
 /// Changes the jobs that `action` names. Appends their new states to `changed`, also those before a failure.

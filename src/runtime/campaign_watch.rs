@@ -21,12 +21,12 @@ const SAMPLES_UNTIL_THINNED: u32 = 12;
 pub async fn watch(store: &Store, run: i64, line: &LabelLine) -> Infallible {
     let mut ticks = interval(SAMPLE_INTERVAL);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let (mut number, mut costs) = (0, None);
+    let (mut number, mut costs) = (0_u32, None);
     loop {
         ticks.tick().await;
         let now = unix_milliseconds();
         let _ = store.add_history_sample(run, now).await;
-        if number % SAMPLES_UNTIL_THINNED == 0 {
+        if number.is_multiple_of(SAMPLES_UNTIL_THINNED) {
             let _ = store.thin_history(now).await;
             costs = estimator(store).await.ok().flatten();
         }

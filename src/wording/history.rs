@@ -7,7 +7,7 @@ use super::cost::{core_time, wall_time};
 use super::date;
 
 /// Width of a curve, characters.
-const WIDTH: usize = 60;
+const WIDTH: usize = 40;
 const BARS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
 
 /// Curves of the quantities over the whole time; a blank where nothing ran.
@@ -117,8 +117,8 @@ mod tests {
         );
         let accepted = shown.lines().find(|line| line.starts_with("accepted")).unwrap();
         let curve: Vec<char> = accepted.chars().skip(17).take(WIDTH).collect();
-        assert!(curve[..19].iter().all(|bar| BARS.contains(bar)), "{accepted}");
-        assert!(curve[22..39].iter().all(|bar| *bar == ' '), "{accepted}");
+        assert!(curve[..12].iter().all(|bar| BARS.contains(bar)), "{accepted}");
+        assert!(curve[15..26].iter().all(|bar| *bar == ' '), "{accepted}");
         assert!(curve[WIDTH - 1] == '█' && accepted.ends_with("  60"), "{accepted}");
         assert!(!shown.contains("failed"), "what never happened is left out: {shown}");
         assert!(text(&CampaignHistory::default()).contains("no run"));

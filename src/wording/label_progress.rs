@@ -1,6 +1,6 @@
 //! Labels that are being made, in words.
 
-use monitor::label_progress::LabelProgress;
+use monitor::label_progress::LabelUnderWay;
 use store::JobState;
 
 use super::cost::wall_time;
@@ -9,7 +9,7 @@ use super::cost::wall_time;
 const NAMED: usize = 3;
 
 /// What is made, by which protocol, for how long, and when it will be done, at the time `now`, ms since 1970.
-pub fn describe(found: &LabelProgress, now: i64) -> String {
+pub fn describe(found: &LabelUnderWay, now: i64) -> String {
     let label = &found.label;
     let attempt = if label.attempt > 1 { format!(", attempt {}", label.attempt) } else { String::new() };
     let elapsed = elapsed(found, now);
@@ -27,13 +27,13 @@ pub fn describe(found: &LabelProgress, now: i64) -> String {
 }
 
 /// The time so far and the expected one, for a column.
-pub fn short(found: &LabelProgress, now: i64) -> String {
+pub fn short(found: &LabelUnderWay, now: i64) -> String {
     let elapsed = wall_time(elapsed(found, now));
     found.expected_seconds.map_or(elapsed.clone(), |expected| format!("{elapsed}/{}", wall_time(expected)))
 }
 
 /// How many labels are made and left, and those under way. `jobs`: number of jobs by protocol and state.
-pub fn line(running: &[LabelProgress], jobs: &[(String, JobState, u64)], now: i64) -> String {
+pub fn line(running: &[LabelUnderWay], jobs: &[(String, JobState, u64)], now: i64) -> String {
     let number = |wanted: JobState| -> u64 {
         jobs.iter().filter(|(_, state, _)| *state == wanted).map(|(.., number)| number).sum()
     };
@@ -46,7 +46,7 @@ pub fn line(running: &[LabelProgress], jobs: &[(String, JobState, u64)], now: i6
     format!("labels: {made} made, {queued} queued, {} under way ({}{more})", running.len(), named.join("; "))
 }
 
-fn elapsed(found: &LabelProgress, now: i64) -> f64 {
+fn elapsed(found: &LabelUnderWay, now: i64) -> f64 {
     (now - found.label.started).max(0) as f64 / 1000.0
 }
 
@@ -56,7 +56,7 @@ mod tests {
 
     use super::*;
 
-    fn progress(expected_seconds: Option<f64>) -> LabelProgress {
+    fn progress(expected_seconds: Option<f64>) -> LabelUnderWay {
         let label = RunningLabel {
             job: 1,
             candidate: "07070707-1.0.5-0123456789abcdef".into(),
@@ -69,7 +69,7 @@ mod tests {
             started: 0,
             cores: Some(4),
         };
-        LabelProgress { label, expected_seconds }
+        LabelUnderWay { label, expected_seconds }
     }
 
     #[test]
@@ -83,7 +83,8 @@ mod tests {
             ("3.2 min/10 min".into(), "1.0 s".into())
         );
         let jobs = [("abinit".into(), JobState::Labelled, 7), ("abinit".into(), JobState::Queued, 2)];
-        let shown = line(&vec![progress(None); 5], &jobs, 1000);
+        let five: [LabelUnderWay; 5] = std::array::from_fn(|_| progress(None));
+        let shown = line(&five, &jobs, 1000);
         assert!(
             shown.starts_with("labels: 7 made, 2 queued, 5 under way (Si8 by abinit: 1.0 s; "),
             "{shown}"

@@ -12,6 +12,7 @@ mod crash;
 mod damage;
 mod exclude;
 mod file;
+mod history;
 mod label_values;
 mod lower_states;
 mod migration;

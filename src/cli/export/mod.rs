@@ -62,8 +62,8 @@ pub struct ExportArgs {
     ///
     /// Combine comparisons with and, or, not and parentheses. A comparison with a missing value is false.
     ///
-    /// Numbers of the structure (= != < <= > >=): gamma and gamma_nbr (largest of its atoms, original mixture), relative_volume (V/V₀),
-    /// kinetic_temperature (K), atoms, fragments (sets of atoms that bonds join),
+    /// Numbers of the structure (= != < <= > >=): gamma and gamma_nbr (largest of its atoms, original mixture), gamma_current (mixture at
+    /// the decision), relative_volume (V/V₀), kinetic_temperature (K), atoms, fragments (sets of atoms that bonds join),
     /// mixture_version (after the decision). Of its walk: walk, step, temperature (K), tau, version (of the
     /// potential). Of its label: energy (eV), energy_per_atom (eV), max_force (eV/Å).
     ///

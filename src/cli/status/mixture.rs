@@ -92,9 +92,9 @@ mod tests {
 
     use super::*;
 
-    fn text(values: &MixtureValues, mode: &str) -> String {
+    fn text(values: &MixtureValues, mode: &str, few: usize) -> String {
         let mut out = Vec::new();
-        let page = StatusLayout { walks: 8, others: 8, few: 8, width: 120 };
+        let page = StatusLayout { walks: 8, others: 8, few, width: 120 };
         write(&mut out, values, &page, mode).unwrap();
         String::from_utf8(out).unwrap()
     }
@@ -105,16 +105,19 @@ mod tests {
         [0, 0, 0].iter().for_each(|age| staleness.add(*age));
         let of =
             |staleness: &Staleness| MixtureValues(vec![(STALENESS.into(), json!(staleness).to_string())]);
-        assert_eq!(text(&of(&staleness), "reproducible"), "");
-        assert!(text(&of(&staleness), "live").contains("at 100.0 % of decisions"));
+        let all = usize::MAX;
+        assert_eq!(text(&of(&staleness), "reproducible", all), "");
+        assert!(text(&of(&staleness), "live", all).contains("at 100.0 % of decisions"));
+        staleness.add(1);
+        assert_eq!(text(&of(&staleness), "live", 8), "", "one version behind is usual");
         [1, 2, 7].iter().for_each(|age| staleness.add(*age));
-        let shown = text(&of(&staleness), "reproducible");
+        let shown = text(&of(&staleness), "reproducible", 8);
         assert!(
-            shown.contains("50.0 % of decisions; versions behind: median 0, 90 % 7, largest 7"),
+            shown.contains("42.9 % of decisions; versions behind: median 1, 90 % 7, largest 7"),
             "{shown}"
         );
         let none = MixtureValues(Vec::new());
-        assert_eq!(text(&none, "live"), "");
+        assert_eq!(text(&none, "live", all), "");
     }
 
     #[test]

@@ -144,8 +144,8 @@ mod tests {
         assert_eq!((cut("γγγγ", 3), cut("γγγ", 3)), ("γγ…".into(), "γγγ".into()));
         assert_eq!((cut_middle("abcdefgh", 5), cut_middle("abc", 3)), ("ab…gh".into(), "abc".into()));
         let names = ["slab-100-vacancy", "slab-110-vacancy"];
-        assert_eq!(name_width(names.into_iter(), 6), 12);
-        assert_ne!(cut_middle(names[0], 12), cut_middle(names[1], 12));
+        assert_eq!(name_width(names.into_iter(), 6), 14);
+        assert_ne!(cut_middle(names[0], 14), cut_middle(names[1], 14));
         assert_eq!((parse_walks("all"), parse_walks("12")), (Ok(usize::MAX), Ok(12)));
         assert!(parse_walks("few").is_err());
     }

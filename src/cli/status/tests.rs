@@ -6,7 +6,7 @@ use std::path::Path;
 use monitor::disk::DiskForecast;
 use monitor::end_reason::CampaignEnd;
 use monitor::label_cost::{CoreHours, QueueCost};
-use monitor::label_progress::LabelProgress;
+use monitor::label_progress::LabelUnderWay;
 use monitor::label_queue::LabelQueue;
 use monitor::mixture_values::MixtureValues;
 use monitor::provenance::Provenance;
@@ -92,7 +92,7 @@ pub fn large() -> Snapshot {
             failures: ["not_converged", "out_of_memory", "implausible"].map(failure).into(),
             unlabelled: vec![unlabelled],
             by_protocol: Vec::new(),
-            running: vec![LabelProgress {
+            running: vec![LabelUnderWay {
                 label: RunningLabel {
                     job: 17,
                     candidate: "07070707-1.0.5-0123456789abcdef".into(),

@@ -10,21 +10,11 @@ use super::page::{StatusLayout, cut_middle, name_width};
 use crate::output::{TextTable, decimals};
 
 /// Least width of the name of a seed structure.
-pub const NAME: usize = 11;
+pub const NAME: usize = 9;
 
 /// Titles of the columns in the format of [`TextTable::new`].
-pub const TITLES: [&str; 10] = [
-    ">walk",
-    "seed structure",
-    "state",
-    ">step",
-    ">steps/s",
-    ">T (K)",
-    ">V/V₀",
-    ">γ_max",
-    ">γ₀_max",
-    ">taken",
-];
+pub const TITLES: [&str; 10] =
+    [">walk", "structure", "state", ">step", ">steps/s", ">T (K)", ">V/V₀", ">γ_max", ">γ₀_max", ">taken"];
 
 /// Selects at most `most` walks, in order of their numbers: running walks with the largest γ first, then those that started
 /// last.
@@ -59,6 +49,7 @@ pub fn write(
     for walk in &shown {
         table.push(line(walk, &varied, run_active, name));
     }
+    table.drop_unknown();
     page.table(out, &table, shown.len(), walks.len(), "walks")
 }
 

@@ -124,13 +124,15 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &WatchState, versions: Op
     let Candidates { seen, accepted, control, .. } = &status.candidates;
     let lines = [
         ("campaign", format!("{}, {} mode: {}", campaign.id, campaign.mode, cli_status::state(status))),
-        (
-            "walks",
-            format!(
-                "{under_way} {state_of_walks}{paused}, {ended} ended{speed}; mixture version {}",
-                status.mixture_version
-            ),
-        ),
+        ("walks", {
+            let going = if under_way > 0 {
+                format!("{under_way} {state_of_walks}{paused}{speed}; ")
+            } else {
+                String::new()
+            };
+            let over = if ended > 0 { format!("{ended} ended; ") } else { String::new() };
+            format!("{going}{over}mixture version {}", status.mixture_version)
+        }),
         (
             "candidates",
             [

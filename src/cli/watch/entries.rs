@@ -1,7 +1,7 @@
 //! Walks, label jobs and decisions as entries of the panes, and their quantities for filters.
 
 use atoms::Species;
-use monitor::label_progress::LabelProgress;
+use monitor::label_progress::LabelUnderWay;
 use store::{DecidedCandidate, JobState, QueueEntry, RecentDecision, WalkStatus, unix_milliseconds};
 use wire::WalkConditions;
 use wire::conditions::VariedConditions;
@@ -22,7 +22,7 @@ pub const DECISIONS: [&str; 9] = [
     ">number",
     "what             ",
     ">walk",
-    "seed structure",
+    "structure",
     ">   step",
     ">T (K)",
     ">V/V₀",
@@ -77,7 +77,7 @@ pub fn walk_entries(
 pub fn job_entries(
     jobs: &[QueueEntry],
     walks: &[WalkStatus],
-    running: &[LabelProgress],
+    running: &[LabelUnderWay],
     filter: Option<&StructureFilter>,
 ) -> Vec<PaneEntry> {
     let now = unix_milliseconds();
@@ -166,7 +166,7 @@ pub fn without_campaign(candidate: &str) -> &str {
     candidate.split_once('-').map_or(candidate, |(_, rest)| rest)
 }
 
-fn state_of_job(job: &QueueEntry, running: &[LabelProgress], now: i64) -> String {
+fn state_of_job(job: &QueueEntry, running: &[LabelUnderWay], now: i64) -> String {
     let progress =
         running.iter().find(|progress| progress.label.job == job.job && job.state == JobState::Leased);
     progress.map_or_else(|| job.state.to_string(), |progress| label_progress::short(progress, now))

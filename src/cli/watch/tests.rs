@@ -123,7 +123,7 @@ fn all_panes_fit_a_small_terminal() {
         "1 walks: 1000",
         "2 queue: 3",
         "3 decisions: 100",
-        "a-lon",
+        "a-lo…re-0",
         "3.0.1-01234567 ",
         "accepted",
         "declined: covered",

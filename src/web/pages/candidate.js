@@ -23,7 +23,8 @@ const ENDS = {
 export async function show(content, address, signal) {
   const id = decodeURIComponent(address);
   const [details, structure] = await Promise.all([fetchJson(candidatePath(id), signal), fetchJson(candidatePath(id, "/structure"), signal)]);
-  content.replaceChildren(element("h1", {}, shortName(details.id)), head(details));
+  const nav = element("nav", { class: "turn", "aria-label": "Neighbours" });
+  content.replaceChildren(element("h1", {}, shortName(details.id)), head(details), nav);
   const { found, grades, decision } = details;
   // The pressed button no longer exists.
   const reload = () => show(content, address, signal).then(() => content.focus());
@@ -31,6 +32,7 @@ export async function show(content, address, signal) {
   if (grades) content.append(section("Grades", graded(grades)));
   if (decision) content.append(section("Decision", decided(decision)));
   if (found) content.append(trace(found, grades, signal));
+  if (decision) neighbours(nav, decision.number, found, signal);
   if (decision) content.append(...covered(decision.coverage));
   content.append(section("Label", ...labels(details, reload, signal)));
   content.append(section("Not recorded", element("ul", {}, details.not_recorded.map((what) => element("li", {}, what)))));
@@ -39,6 +41,17 @@ export async function show(content, address, signal) {
 function head({ id, origin, decision, jobs }) {
   const fate = decision && (decision.reason ?? decision.kind);
   return element("p", { class: "head" }, state(origin), fate && fate !== origin && state(fate), jobs.map((job) => state(job.state)), element("code", {}, id));
+}
+
+/** Links to the candidates decided before and after, and to those of the same walk. */
+async function neighbours(nav, decision, found, signal) {
+  const query = (ascending) => `/api/candidates?limit=1&ascending=${ascending}&after=0:${decision}:0`;
+  const pages = await Promise.all([false, true].map((ascending) => fetchJson(query(ascending), signal).catch(() => ({ candidates: [] }))));
+  const [before, after] = pages.map((page) => page.candidates[0]);
+  const to = (one, text) => one && element("a", { href: `#candidate/${encodeURIComponent(one.id)}`, title: one.id }, text);
+  const where = new URLSearchParams({ where: `walk = ${found?.walk}` });
+  const links = [to(before, "← previous"), found && element("a", { href: `#candidates/${where}` }, `all of walk ${whole(found.walk)}`), to(after, "next →")];
+  nav.replaceChildren(...links.filter(Boolean).flatMap((link, k) => (k > 0 ? [" ", link] : [link])));
 }
 
 function about({ structure, found, file, frame, same_structure: same, same_import: imported }) {

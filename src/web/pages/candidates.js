@@ -11,7 +11,7 @@ const LENGTH = 50;
 const STATES = ["queued", "leased", "labelled", "failed", "dropped", "superseded"];
 /** Columns: title, whether it is numeric, and the sort order of its title. */
 const COLUMNS = [["candidate"], ["decision", true, "decision"], ["fate"], ["label"], ["priority", true, "queue"], ["value", true], ["γ_max", true], ["γ₀_max", true, "gamma"],
-  ["γ₀_nbr", true], ["V/V₀", true, "relative_volume"], ["T", true], ["seed structure"], ["formula"], ["atoms", true], ["attempts", true]];
+  ["γ₀_nbr", true], ["V/V₀", true, "relative_volume"], ["T", true], ["seed structure"], ["formula"], ["atoms", true], ["E (eV per atom)", true], ["F_max (eV/Å)", true], ["attempts", true]];
 
 export function show(content, rest, signal) {
   // The query is part of the address, so that it can be bookmarked and shared.
@@ -125,6 +125,6 @@ function line(candidate, columns) {
     candidate.priority ?? "–", labelValue(candidate.value), decimals(candidate.selector_gamma, 2), decimals(candidate.gamma, 2),
     decimals(candidate.gamma_nbr, 2),
     decimals(candidate.relative_volume, 4), decimals(candidate.temperature, 0, "K"), candidate.seed_structure, candidate.formula,
-    whole(candidate.atoms), candidate.attempts ?? "–", whole(candidate.version)];
+    whole(candidate.atoms), decimals(candidate.energy == null ? null : candidate.energy / candidate.atoms, 4), decimals(candidate.max_force, 3), candidate.attempts ?? "–", whole(candidate.version)];
   return element("tr", {}, columns.map(([, isNumber], k) => element("td", { class: isNumber && "number" }, cells[k])));
 }

@@ -2,7 +2,7 @@
 
 import { fetchJson } from "./api.js";
 import { DASHES, LINES } from "./colours.js";
-import { digits, whole } from "./format.js";
+import { whole } from "./format.js";
 import { plot } from "./plot.js";
 
 /** Time between two readings, ms. */
@@ -45,13 +45,13 @@ function drawn({ samples, limits }) {
       { name: "made", colour: LINES[2], points: line((one) => one.labels) },
       { name: "in the queue", colour: LINES[0], dash: DASHES[1], points: line((one) => one.queued + one.leased) },
       ...limit(limits.labels, "budget")] }),
-    plot({ title: "Cost of labels", x, y: { title: seconds ? "core-seconds" : "core-hours", least: 0, ticks: digits }, lines: [
+    plot({ title: "Cost of labels", x, y: { title: seconds ? "core-seconds" : "core-hours", least: 0 }, lines: [
       { name: "spent", colour: LINES[2], points: line((one) => cost * one.core_hours) },
       ...limit(limits.core_hours == null ? null : cost * limits.core_hours, "budget")] }),
     plot({ title: "Failures", x, y: { title: "number", least: 0, most: 4, ticks: whole }, lines: [
       { name: "failed attempts", colour: LINES[1], points: line((one) => one.failed_attempts) },
       { name: "labels that failed for good", colour: LINES[3], dash: DASHES[1], points: line((one) => one.failed_jobs) }] }),
-    plot({ title: "Throughput", x, y: { title: "steps/s of all walks", least: 0, ticks: digits },
+    plot({ title: "Throughput", x, y: { title: "steps/s of all walks", least: 0 },
       lines: [{ colour: LINES[0], points: line((one) => one.steps_per_second) }] }),
     plot({ title: "Versions of the mixture", x, y: { title: "version", least: 0, most: 4, ticks: whole },
       lines: [{ colour: LINES[0], points: line((one) => one.mixture_version) }] }),
@@ -68,7 +68,7 @@ function timeAxis(samples) {
     const date = new Date(origin.getTime() + Math.round(minutes * 60) * 1000);
     const isDay = Math.abs(minutes / DAY - Math.round(minutes / DAY)) < 1e-9;
     if (isDay) return date.toLocaleDateString([], { day: "numeric", month: "short" });
-    return date.toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", ...(most - least < 5 && { second: "2-digit" }) });
+    return date.toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", hourCycle: "h23", ...(most - least < 5 && { second: "2-digit" }) });
   };
   return { at, x: { title: "local time", least, most, steps: STEPS, ticks } };
 }

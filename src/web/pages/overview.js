@@ -92,7 +92,7 @@ function summary(status) {
       training?.atoms ? `training atoms with γ > 1: ${percent(training.share_above_one)}` : "training frames are not monitored",
       ...forgotten(training?.elements ?? []),
       training?.alarm ? element("span", { class: "wrong" }, `forgetting: above ${exceeded(training)}`) : "",
-      staleness ? `walkers had the newest version in ${percent(staleness.share_of_newest)} of decisions` : ""),
+      staleness?.quantile_90 > 1 ? `walkers had the newest version in ${percent(staleness.share_of_newest)} of decisions` : ""),
   ].filter(Boolean);
 }
 
@@ -174,8 +174,8 @@ function budget(status) {
   const hours = (value) => (value == null ? null : digits(value, "h"));
   return facts([
     ["labels", `${whole(used.labels)}${limits.labels == null ? "" : ` of ${whole(limits.labels)}`}`],
-    ["core-hours", of(used.core_hours, limits.core_hours, "core-hours")],
-    ["running time", of(used.wall_hours, limits.wall_hours, "h")],
+    ["cost of labels", limits.core_hours == null ? coreTime(used.core_hours) : of(used.core_hours, limits.core_hours, "core-hours")],
+    ["running time", limits.wall_hours == null ? duration(3.6e6 * used.wall_hours) : of(used.wall_hours, limits.wall_hours, "h")],
     ["used up", over],
     ["expected end", end.time == null ? null : `${time(end.time)} at the latest, if nothing changes`],
     ["walks need", hours(end.walks_hours)],

@@ -37,6 +37,7 @@ function drawn(samples) {
   const at = (sample) => (sample.time - last) / x.unit;
   const line = (read) => samples.map((sample) => [at(sample), read(sample)]);
   const walks = [...new Set(samples.flatMap((sample) => Object.keys(sample.gamma)))].slice(-LINES.length * DASHES.length);
+  if (walks.length === 0) return [];
   return [
     plot({ title: "Grade of walks since the dashboard started", x, y: { title: "γ_max", least: 0, most: 1 }, lines: walks.map((walk, k) => ({
       name: `walk ${walk}`, colour: LINES[k % LINES.length], dash: DASHES[Math.floor(k / LINES.length) % DASHES.length],

@@ -17,7 +17,7 @@ export async function show(content, address, signal) {
   let [trace, candidates] = await read();
   const [head, plots, inPs] = [element("div"), element("div", { class: "plots" }), element("input", { type: "checkbox" })];
   const draw = () => {
-    head.replaceChildren(about(trace));
+    head.replaceChildren(about({ ...trace, walk: address }));
     plots.replaceChildren(...drawn(trace, candidates, inPs.checked));
   };
   inPs.addEventListener("change", draw);
@@ -34,7 +34,7 @@ export async function show(content, address, signal) {
   }, signal);
 }
 
-function about({ seed_structure: seed, origin, state: how, conditions, points, threshold }) {
+function about({ walk, seed_structure: seed, origin, state: how, conditions, points, threshold }) {
   const now = points.at(-1);
   return facts([
     ["seed structure", seed],
@@ -45,6 +45,7 @@ function about({ seed_structure: seed, origin, state: how, conditions, points, t
       conditions.volume_ramp ? `, V/V₀ ${digits(conditions.volume_ramp[0])} to ${digits(conditions.volume_ramp[1])}` : ""}`],
     ["threshold of the collection rule", threshold == null ? null : `γ ${digits(threshold)}`],
     ["newest point", now && `step ${whole(now.step)}, ${digits(now.time / 1000, "ps")}: ${decimals(now.temperature, 0, "K")}`],
+    ["candidates", element("a", { href: `#candidates/${new URLSearchParams({ where: `walk = ${walk}` })}` }, "those of this walk")],
     ["points", points.length > 0 ? whole(points.length) : "none yet, or walk.trace_interval = 0"],
   ]);
 }
