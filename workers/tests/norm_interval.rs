@@ -116,9 +116,9 @@ fn the_walk_stays_close_to_one_that_measures_always() {
 
 #[test]
 fn a_split_assignment_gives_the_same_result() {
-    for volume_ramp in [None, Some((0.98, 1.1))] {
+    for cell in [CellConditions::Fixed, CellConditions::VolumeRamp { from: 0.98, to: 1.1 }] {
         let (settings, mut next) = on_the_slab(4, 7, 90);
-        next.conditions.volume_ramp = volume_ramp;
+        next.conditions.cell = cell;
         let whole = run(&settings, &next);
         assert_eq!((&whole.outcome, whole.progress.step), (&Outcome::StepsDone, 90));
         let mut trace = Vec::new();
