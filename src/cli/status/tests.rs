@@ -142,11 +142,15 @@ fn status() -> CampaignStatus {
         gamma_max: Some(123.45),
         steps_per_second: Some(1234.5),
         conditions: Some(WalkConditions {
-            cell: wire::CellConditions::ConstantPressure(wire::ConstantPressure {
-                pressure: 1.0,
-                start_volume: 1.0,
-                cell_bias: true,
-            }),
+            cell: if number.is_multiple_of(2) {
+                wire::CellConditions::ConstantPressure(wire::ConstantPressure {
+                    pressure: 1.0,
+                    start_volume: 1.0,
+                    cell_bias: true,
+                })
+            } else {
+                wire::CellConditions::VolumeRamp { from: 1.0, to: 1.4 }
+            },
             ..WalkConditions::default()
         }),
         accepted: 300,
