@@ -10,6 +10,9 @@ use super::date;
 const WIDTH: usize = 40;
 const BARS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
 
+/// What a curve shows of a sample.
+type SampleQuantity = fn(&HistorySample) -> Option<f64>;
+
 /// Curves of the quantities over the whole time; a blank where nothing ran.
 pub fn text(history: &CampaignHistory) -> String {
     let (Some(first), Some(last)) = (history.samples.first(), history.samples.last()) else {
@@ -27,7 +30,7 @@ pub fn text(history: &CampaignHistory) -> String {
         None => core_time(last.core_hours),
     };
     let speed = last.steps_per_second.map_or("–".to_owned(), |speed| format!("{speed:.1}"));
-    let rows: [(&str, fn(&HistorySample) -> Option<f64>, String); 8] = [
+    let rows: [(&str, SampleQuantity, String); 8] = [
         ("accepted", |one| Some(one.accepted as f64), last.accepted.to_string()),
         (
             "labels",
@@ -64,7 +67,7 @@ pub fn text(history: &CampaignHistory) -> String {
 }
 
 /// A bar for each part of the time, from 0 to the largest value.
-fn curve(history: &CampaignHistory, of: fn(&HistorySample) -> Option<f64>) -> String {
+fn curve(history: &CampaignHistory, of: SampleQuantity) -> String {
     let (Some(first), Some(last)) = (history.samples.first(), history.samples.last()) else {
         return String::new();
     };
@@ -80,12 +83,7 @@ fn curve(history: &CampaignHistory, of: fn(&HistorySample) -> Option<f64>) -> St
 }
 
 /// The last value before `end`, if a run lasted at any time from `begin` on.
-fn value_at(
-    history: &CampaignHistory,
-    begin: i64,
-    end: i64,
-    of: fn(&HistorySample) -> Option<f64>,
-) -> Option<f64> {
+fn value_at(history: &CampaignHistory, begin: i64, end: i64, of: SampleQuantity) -> Option<f64> {
     let during = |run: &&[HistorySample]| {
         run.first().is_some_and(|first| first.time < end) && run.last().is_some_and(|last| last.time >= begin)
     };
