@@ -61,7 +61,7 @@ fn a_bad_label_is_left_out_until_it_is_included_again() {
     // Every view of the label or the campaign shows it.
     let status = json(here, ["status", "here"]);
     assert_eq!(status["labels"]["excluded"], 1);
-    assert!(succeed(here, ["status", "here"]).contains("1 labels excluded"));
+    assert!(succeed(here, ["status", "here"]).contains("1 label excluded"));
     let shown = succeed(here, ["queue", "here", "show", bad]);
     assert!(shown.contains(&format!("excluded  from exports and statistics: {report}")), "{shown}");
     let listed = succeed(here, ["queue", "here", "list", "--limit", "1000"]);

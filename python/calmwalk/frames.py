@@ -59,7 +59,8 @@ def candidate_atoms(candidate: Candidate, campaign: str, has_versions: bool) -> 
     """A candidate; its label, if it has one, is the result of the frame's calculator.
 
     The potential's own energy, forces and virial are ``model_energy`` (eV), ``model_virial`` (eV) and ``model_forces``
-    (eV/Å). ``gamma`` and ``gamma_nbr`` are those of the original mixture.
+    (eV/Å). ``gamma`` and ``gamma_nbr`` are those of the original mixture, whose largest γ is ``gamma_max_original``;
+    ``gamma_max`` is that under the mixture at the decision.
     """
     atoms = structure_atoms(candidate.structure)
     info: dict[str, Any] = {"campaign": campaign, "fragments": count_fragments(atoms)}
@@ -85,6 +86,9 @@ def candidate_atoms(candidate: Candidate, campaign: str, has_versions: bool) -> 
     }
     if candidate.reason:
         info["reason"] = candidate.reason
+    for key, gamma in (("gamma_max", candidate.selector_gamma), ("gamma_max_original", candidate.original_gamma)):
+        if gamma is not None:
+            info[key] = float(np.max(gamma))
     atoms.info = info
     if candidate.original_gamma is not None and candidate.original_gamma_nbr is not None:
         atoms.arrays["gamma"] = np.array(candidate.original_gamma)
