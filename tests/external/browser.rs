@@ -230,7 +230,10 @@ fn table(browser: &Browser, page: &str) {
     assert_eq!(browser.run("return location.hash"), "#candidates/fate=accepted", "the page stays");
     browser.press(&[TAB]);
     assert_eq!(browser.run("return document.activeElement.tagName"), "SELECT", "the first filter");
-    let column = "[...document.querySelectorAll('.candidates tbody tr')].map((row) => Number(row.cells[6].textContent))";
+    let sorted = "document.querySelector('th[aria-sort=descending]').cellIndex";
+    let column = format!(
+        "[...document.querySelectorAll('.candidates tbody tr')].map((row) => Number(row.cells[{sorted}].textContent))"
+    );
     // Sort with the keyboard; the focus stays on the button.
     browser.run("document.querySelector('button.sort[data-keep=gamma]').focus()");
     browser.press(&[ENTER]);
