@@ -67,7 +67,7 @@ impl World {
         self.wake_labellers_of(id);
     }
 
-    /// Ends a calculation, whose result nobody will read.
+    /// Ends a calculation. Its result is not read.
     pub fn remove_calculation(&mut self, id: &str) {
         if let Some(calculation) = self.calculations.get_mut(id) {
             calculation.state = CalculationState::Gone;
