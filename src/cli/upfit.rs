@@ -79,10 +79,11 @@ pub struct UpfitArgs {
     /// AMSGrad, as gracemaker has it
     #[arg(long, value_name = "NAME", default_value = Optimiser::default().name(), value_parser = optimisers())]
     optimiser: Optimiser,
-    /// Learning rate of the first update; it falls by half a cosine [default: 0.05 with soap, 0.001 with adam]
+    /// Learning rate; it falls by half a cosine. With soap, it rises to this value during the first 100 updates [default: 0.05 with soap,
+    /// 0.001 with adam]
     #[arg(long, value_name = "RATE", value_parser = positive)]
     learning_rate: Option<f64>,
-    /// Learning rate of the last update [default: a hundredth of --learning-rate]
+    /// Learning rate at the end [default: a hundredth of --learning-rate]
     #[arg(long, value_name = "RATE", value_parser = not_negative)]
     min_learning_rate: Option<f64>,
     /// Structures for each update

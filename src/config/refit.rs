@@ -111,7 +111,8 @@ pub struct NativeRefit {
     pub batch_size: NonZeroU32,
     /// What turns gradients into steps.
     pub optimiser: Optimiser,
-    /// Learning rate of the first update; it falls by half a cosine. Default: 0.05 with `optimiser = "soap"`, 0.001 with `"adam"`.
+    /// Learning rate; it falls by half a cosine. With `optimiser = "soap"`, it rises to this value during the first 100 updates.
+    /// Default: 0.05 with `"soap"`, 0.001 with `"adam"`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub learning_rate: Option<Positive>,
     /// Learning rate of the last update, at most `learning_rate`. Default: a hundredth of it.
@@ -223,7 +224,7 @@ impl NativeRefit {
         self.epochs.map_or(self.optimiser.default_epochs(), NonZeroU64::get)
     }
 
-    /// Learning rate of the first update.
+    /// `learning_rate`, or that of the optimiser.
     pub fn first_learning_rate(&self) -> f64 {
         self.learning_rate.map_or(self.optimiser.default_learning_rate(), Positive::get)
     }

@@ -18,9 +18,21 @@ impl CosineDecay {
     }
 }
 
+/// Share of the learning rate at update number `update` (from 0) of a warm-up of `updates`, after which it is 1.
+pub fn warm_up_share(update: u64, updates: u64) -> f64 {
+    if update < updates { (update + 1) as f64 / updates as f64 } else { 1.0 }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_warm_up_rises_to_1() {
+        let shares = [0, 1, 3, 4, 1000].map(|update| warm_up_share(update, 4));
+        assert_eq!(shares, [0.25, 0.5, 1.0, 1.0, 1.0]);
+        assert_eq!(warm_up_share(0, 0), 1.0);
+    }
 
     #[test]
     fn the_rate_falls_by_half_a_cosine() {

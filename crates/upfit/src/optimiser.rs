@@ -56,6 +56,16 @@ impl Optimiser {
         }
     }
 
+    /// Number of updates over which the learning rate rises linearly. The first steps of SOAP are as large as the rate in all
+    /// directions, while its eigenbases are those of few gradients: without the rise, a training of some tens of updates spoils
+    /// the weights (docs/benchmarks.md).
+    pub fn warm_up(self) -> u64 {
+        match self {
+            Self::Adam => 0,
+            Self::Soap => 100,
+        }
+    }
+
     /// Its state before the first step of the weights of these groups.
     pub fn start(self, groups: &[WeightGroup]) -> OptimiserState {
         match self {

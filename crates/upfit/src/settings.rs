@@ -16,7 +16,7 @@ pub struct UpfitSettings {
     pub optimiser: Optimiser,
     /// The loss.
     pub loss: LossSettings,
-    /// Of the first update and of the last.
+    /// Of the first update and of the last, without the warm-up of the optimiser.
     pub learning_rate: CosineDecay,
     /// Random seed of the order of the structures.
     pub seed: u64,

@@ -18,6 +18,7 @@ use crate::error::UpfitError;
 use crate::evaluation::{EvaluatedFrame, evaluate};
 use crate::frozen::frozen_weights;
 use crate::identity::identity;
+use crate::learning_rate::warm_up_share;
 use crate::loss::LossWeights;
 use crate::prepared::{NEIGHBOUR_BYTES, PreparedFrame, prepare};
 use crate::progress::{TrainingEvent, UpdateProgress};
@@ -155,7 +156,8 @@ impl<'a> Trainer<'a> {
 
     /// The learning rate of update number `update`, from 0.
     fn rate(&self, update: u64) -> f64 {
-        self.settings.learning_rate.rate(update, self.all_updates())
+        let warm_up = warm_up_share(update, self.settings.optimiser.warm_up());
+        warm_up * self.settings.learning_rate.rate(update, self.all_updates())
     }
 
     fn updates_per_second(&self, state: &TrainingState) -> f64 {

@@ -96,7 +96,8 @@ fn other_optimiser(settings: &UpfitSettings) -> UpfitSettings {
 #[test]
 fn soap_lowers_the_loss_and_keeps_frozen_weights() {
     let frozen = vec!["energy_mlp".to_owned()];
-    let learning_rate = CosineDecay { first: 1e-2, last: 1e-4 };
+    // The warm-up leaves rates of 0.003 to 0.011 to eight updates.
+    let learning_rate = CosineDecay { first: 0.3, last: 3e-3 };
     let trained = train(
         &data(),
         &UpfitSettings { epochs: 4, optimiser: Optimiser::Soap, learning_rate, frozen, ..settings() },
@@ -174,6 +175,17 @@ fn patience_ends_a_training_that_gets_no_better() {
     let outcome = train(&split(aluminium(4), 0.25, 1).unwrap(), &rough);
     assert!(outcome.ended_early && outcome.history.len() < 9, "{:?}", outcome.history);
     assert_eq!((outcome.epoch, outcome.model.weights()), (0, model().weights()));
+}
+
+/// SOAP's default rate is for hundreds of updates; its warm-up keeps the first ones small.
+#[test]
+fn soap_improves_a_model_in_four_updates() {
+    let soap = Optimiser::Soap;
+    let decay = CosineDecay { first: soap.default_learning_rate(), last: 0.0 };
+    let soap =
+        UpfitSettings { optimiser: soap, learning_rate: decay, loss: LossSettings::demo(), ..settings() };
+    let outcome = train(&split(stronger(8), 0.5, 1).unwrap(), &soap);
+    assert_eq!((outcome.history.len(), outcome.epoch), (2, 2), "{:?}", outcome.history);
 }
 
 /// A process that is killed before the model is in its file loses nothing.
