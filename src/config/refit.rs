@@ -115,7 +115,7 @@ pub struct NativeRefit {
     /// Default: 0.05 with `"soap"`, 0.001 with `"adam"`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub learning_rate: Option<Positive>,
-    /// Learning rate of the last update, at most `learning_rate`. Default: a hundredth of it.
+    /// Learning rate at the end, at most `learning_rate`. Default: a hundredth of it.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("minimum" = 0))]
     pub min_learning_rate: Option<f64>,
