@@ -35,6 +35,7 @@ const FILES: &[(&str, &str)] = files![
     "map.js",
     "mixture.js",
     "overview.js",
+    "parity.js",
     "plot.js",
     "plots.js",
     "structure.js",
