@@ -14,6 +14,7 @@ mod calm_export;
 mod calm_sample;
 mod calm_validate;
 mod certificates;
+mod chemistry;
 mod cli_calm;
 mod cli_campaign;
 mod cli_md;

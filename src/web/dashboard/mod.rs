@@ -63,6 +63,7 @@ impl Dashboard {
             .route("/api/samples", get(sse::samples))
             .route("/api/history", get(history::history))
             .route("/api/candidates", get(candidate_table::page))
+            .route("/api/candidates.extxyz", get(candidate_table::download::extxyz))
             .route("/api/candidates/{id}", get(candidate::details))
             .route("/api/candidates/{id}/structure", get(candidate::structure))
             .route("/api/candidates/{id}/structure.extxyz", get(candidate::extxyz))

@@ -1,49 +1,34 @@
 //! The table of candidates, one page at a time. A request scans a limited number of candidates. If a filter matches
 //! few of them, the response says how many were scanned and where to continue.
 
+mod columns;
+pub mod download;
+mod query;
+mod sorted;
+
 use std::collections::{BTreeMap, HashMap};
-use std::str::FromStr;
 
 use atoms::Species;
 use axum::extract::{RawQuery, State};
+use monitor::candidate_errors::ErrorReader;
 use serde_json::json;
-use store::{JobState, ListCursor, ListOrder, ListedCandidate, NO_LABEL_VALUE, Store, StoreError};
+use store::{ListCursor, ListOrder, ListedCandidate, NO_LABEL_VALUE, Store, StoreError};
 use wire::{WalkConditions, WalkId};
 
+use self::columns::TableRow;
+use self::query::{CandidateQuery, PagePlace, TableOrder};
 use super::Dashboard;
-use super::response::{ApiError, ApiResult, json};
-use crate::filter::{StructureFilter, StructureProperties, species};
+use super::response::{ApiResult, json};
+use crate::filter::{StructureProperties, species};
 
-/// Largest number of rows of a page.
+/// Largest number of rows of a page, and the number without `limit`.
 const MAX_PAGE_ROWS: u32 = 200;
+const DEFAULT_ROWS: u32 = 50;
 /// Candidates read at a time when rows are filtered, and the largest number scanned for a response.
 const SCAN_ROWS: u32 = 1000;
 const MAX_SCANNED: usize = 10_000;
 
-/// Parameters of a request.
-#[derive(Debug, Default)]
-struct CandidateQuery {
-    order: TableOrder,
-    ascending: bool,
-    fate: Option<String>,
-    state: Option<JobState>,
-    filter: Option<StructureFilter>,
-    after: Option<ListCursor>,
-    limit: Option<u32>,
-}
-
-/// Order of the rows.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-enum TableOrder {
-    #[default]
-    Decision,
-    Gamma,
-    RelativeVolume,
-    /// Order in which the jobs of one state would be labelled.
-    Queue,
-}
-
-/// A page of the table.
+/// Rows of the table.
 #[derive(Debug, Default)]
 struct CandidatePage {
     rows: Vec<ListedCandidate>,
@@ -52,61 +37,61 @@ struct CandidatePage {
     scanned: usize,
 }
 
-/// `versions` are those of the potential by row; null in a campaign whose walks all have version 0.
+/// `versions` are those of the potential by row; null in a campaign whose walks all have version 0. `errors` are by row too.
 ///
 /// `GET /api/candidates?order=…&ascending=…&fate=…&state=…&where=…&after=…&limit=…`
 pub async fn page(State(dashboard): State<Dashboard>, RawQuery(query): RawQuery) -> ApiResult {
     let query = CandidateQuery::parse(query.as_deref().unwrap_or_default())?;
-    let CandidatePage { rows, next, scanned } = query.page(&dashboard.store).await?;
-    let next = next.map(|place| format!("{:?}:{}:{}", place.value, place.decision, place.priority));
+    let store = &dashboard.store;
+    let versions = store.walk_versions().await?;
+    let mut reader = ErrorReader::new(store).await?;
+    let (rows, next, scanned, sorted) = if let TableOrder::Column(column) = query.order {
+        let found = sorted::page(&query, column, store, &versions, &mut reader).await?;
+        (found.rows, found.next, found.scanned, Some(found.among))
+    } else {
+        let CandidatePage { rows, next, scanned } = query.page(store).await?;
+        let mut found = Vec::new();
+        for candidate in rows {
+            let version = versions.version_of(candidate.walk);
+            let errors = match candidate.energy {
+                Some(_) => reader.read(store, candidate.decision, version).await?,
+                None => None,
+            };
+            found.push(TableRow { candidate, version, errors });
+        }
+        (found, next.map(PagePlace::Behind), scanned, None)
+    };
     let imported = match query.state.filter(|_| query.order == TableOrder::Queue) {
-        Some(state) => Some(dashboard.store.imported_jobs(state).await?),
+        Some(state) => Some(store.imported_jobs(state).await?),
         None => None,
     };
-    let versions = dashboard.store.walk_versions().await?;
-    let of_rows = || rows.iter().map(|row| versions.version_of(row.walk)).collect::<Vec<_>>();
-    let versions = (!versions.is_single()).then(of_rows);
+    let of_rows = || rows.iter().map(|row| row.version).collect::<Vec<_>>();
+    let version_of_rows = (!versions.is_single()).then(of_rows);
+    let errors: Vec<_> = rows.iter().map(|row| row.errors).collect();
+    let candidates: Vec<_> = rows.iter().map(|row| &row.candidate).collect();
     json(&json!({
-        "candidates": rows, "versions": versions, "next": next, "scanned": scanned, "imported": imported,
+        "candidates": candidates, "versions": version_of_rows, "errors": errors, "next": next.map(PagePlace::text),
+        "scanned": scanned, "imported": imported, "sorted_among": sorted,
     }))
 }
 
 impl CandidateQuery {
-    fn parse(text: &str) -> Result<Self, ApiError> {
-        let mut query = Self::default();
-        for (key, value) in form_urlencoded::parse(text.as_bytes()).filter(|(_, value)| !value.is_empty()) {
-            match key.as_ref() {
-                "order" => query.order = value.parse()?,
-                "ascending" => query.ascending = value == "true",
-                "fate" => query.fate = Some(value.into_owned()),
-                "state" => {
-                    let unknown = || {
-                        ApiError::bad_request(format!("state is '{value}', expected a state of label jobs"))
-                    };
-                    query.state = Some(JobState::named(&value).ok_or_else(unknown)?);
-                }
-                "where" => query.filter = Some(value.parse().map_err(ApiError::bad_request)?),
-                "after" => query.after = Some(parse_cursor(&value)?),
-                "limit" => {
-                    let wrong = || {
-                        ApiError::bad_request(format!("limit is '{value}', expected 1 to {MAX_PAGE_ROWS}"))
-                    };
-                    let limit = value.parse().ok().filter(|limit| (1..=MAX_PAGE_ROWS).contains(limit));
-                    query.limit = Some(limit.ok_or_else(wrong)?);
-                }
-                _ => return Err(ApiError::bad_request(format!("unknown parameter '{key}'"))),
-            }
-        }
-        if query.order == TableOrder::Queue && query.state.is_none() {
-            return Err(ApiError::bad_request("the order 'queue' applies to one state: give 'state' too"));
-        }
-        Ok(query)
+    /// A page in an order that has an index.
+    async fn page(&self, store: &Store) -> Result<CandidatePage, StoreError> {
+        let limit = self.limit.unwrap_or(DEFAULT_ROWS);
+        self.collect(store, self.cursor(), limit as usize, MAX_SCANNED).await
     }
 
-    async fn page(&self, store: &Store) -> Result<CandidatePage, StoreError> {
-        let limit = self.limit.unwrap_or(50);
-        let window = if self.filters_rows() { SCAN_ROWS } else { limit };
-        let (mut page, mut place, mut elements) = (CandidatePage::default(), self.after, HashMap::new());
+    /// At most `limit` matching rows behind a cursor, in an order that has an index.
+    async fn collect(
+        &self,
+        store: &Store,
+        after: Option<ListCursor>,
+        limit: usize,
+        max_scanned: usize,
+    ) -> Result<CandidatePage, StoreError> {
+        let window = if self.filters_rows() { SCAN_ROWS } else { SCAN_ROWS.min(limit as u32) };
+        let (mut page, mut place, mut elements) = (CandidatePage::default(), after, HashMap::new());
         let conditions = match self.filter {
             Some(_) => store.walk_conditions().await?,
             None => BTreeMap::new(),
@@ -120,12 +105,12 @@ impl CandidateQuery {
                 if self.matches(&row, &mut elements, &conditions) {
                     page.rows.push(row);
                 }
-                if page.rows.len() == limit as usize {
+                if page.rows.len() == limit {
                     page.next = place;
                     return Ok(page);
                 }
             }
-            if is_last || page.scanned >= MAX_SCANNED {
+            if is_last || page.scanned >= max_scanned {
                 page.next = place.filter(|_| !is_last);
                 return Ok(page);
             }
@@ -134,7 +119,8 @@ impl CandidateQuery {
 
     /// Whether rows that are read may be filtered out.
     fn filters_rows(&self) -> bool {
-        let by_fate = self.fate.is_some() && self.order != TableOrder::Decision;
+        let has_order = !matches!(self.order, TableOrder::Decision | TableOrder::Column(_));
+        let by_fate = self.fate.is_some() && has_order;
         let by_state = self.state.is_some() && self.order != TableOrder::Queue;
         by_fate || by_state || self.filter.is_some()
     }
@@ -145,12 +131,13 @@ impl CandidateQuery {
         after: Option<ListCursor>,
         limit: u32,
     ) -> Result<Vec<ListedCandidate>, StoreError> {
-        let descending = !self.ascending;
+        // By a column, the newest are sorted.
+        let descending = !self.ascending || matches!(self.order, TableOrder::Column(_));
         let order = match (self.order, self.state, self.fate.as_deref()) {
             (TableOrder::Queue, Some(state), _) => {
                 return store.list_queue(state, after, limit).await;
             }
-            (TableOrder::Decision, _, Some(fate)) => {
+            (TableOrder::Decision | TableOrder::Column(_), _, Some(fate)) => {
                 let (origin, reason) = match fate {
                     "control" => ("control", None),
                     "accepted" => ("biased", None),
@@ -161,14 +148,14 @@ impl CandidateQuery {
             }
             (TableOrder::Gamma, ..) => ListOrder::Gamma,
             (TableOrder::RelativeVolume, ..) => ListOrder::Volume,
-            (TableOrder::Decision | TableOrder::Queue, ..) => ListOrder::Decision,
+            (TableOrder::Decision | TableOrder::Queue | TableOrder::Column(_), ..) => ListOrder::Decision,
         };
         store.list_candidates(order, descending, after, limit).await
     }
 
     fn cursor_of(&self, row: &ListedCandidate) -> ListCursor {
         let value = match self.order {
-            TableOrder::Decision => None,
+            TableOrder::Decision | TableOrder::Column(_) => None,
             TableOrder::Gamma => row.gamma,
             TableOrder::RelativeVolume => row.relative_volume,
             TableOrder::Queue => Some(row.value.unwrap_or(NO_LABEL_VALUE)),
@@ -224,32 +211,6 @@ fn properties<'a>(
     }
 }
 
-impl FromStr for TableOrder {
-    type Err = ApiError;
-
-    fn from_str(name: &str) -> Result<Self, ApiError> {
-        match name {
-            "decision" => Ok(Self::Decision),
-            "gamma" => Ok(Self::Gamma),
-            "relative_volume" => Ok(Self::RelativeVolume),
-            "queue" => Ok(Self::Queue),
-            _ => Err(ApiError::bad_request(format!(
-                "order is '{name}', expected one of decision, gamma, relative_volume, queue"
-            ))),
-        }
-    }
-}
-
-fn parse_cursor(text: &str) -> Result<ListCursor, ApiError> {
-    let read = |(value, place): (&str, &str)| {
-        let value = value.parse().ok().filter(|value: &f64| value.is_finite())?;
-        let (decision, priority) = place.split_once(':')?;
-        Some(ListCursor { priority: priority.parse().ok()?, value, decision: decision.parse().ok()? })
-    };
-    let wrong = || ApiError::bad_request(format!("after is '{text}', expected 'next' of the previous page"));
-    text.split_once(':').and_then(read).ok_or_else(wrong)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -261,26 +222,5 @@ mod tests {
         assert_eq!(symbols("C"), "C");
         assert_eq!(symbols(""), "");
         assert_eq!(symbols("Xx2é9"), "");
-    }
-
-    #[test]
-    fn queries_are_parsed_or_refused_with_a_reason() {
-        let query =
-            CandidateQuery::parse("order=gamma&ascending=true&fate=&where=gamma+%3E+2&after=2.5:17:10")
-                .unwrap();
-        assert!(query.order == TableOrder::Gamma && query.ascending && query.fate.is_none());
-        assert_eq!(query.filter.unwrap().to_string(), "gamma > 2.0");
-        assert_eq!(query.after, Some(ListCursor { priority: 10, value: 2.5, decision: 17 }));
-        for (query, why) in [
-            ("order=size", "expected one of decision"),
-            ("order=queue", "give 'state'"),
-            ("limit=0", "expected 1 to 200"),
-            ("after=NaN:1", "expected 'next'"),
-            ("where=gamma", "expected one of = != <"),
-            ("sort=gamma", "unknown parameter 'sort'"),
-        ] {
-            let refused = format!("{:?}", CandidateQuery::parse(query).unwrap_err());
-            assert!(refused.contains(why), "{query}: {refused}");
-        }
     }
 }
