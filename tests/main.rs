@@ -23,6 +23,7 @@ mod constant_pressure;
 mod dashboard;
 mod doctor;
 mod documentation;
+mod dry_runs;
 mod energies;
 mod error_bounds;
 mod errors;
