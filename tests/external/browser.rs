@@ -260,6 +260,8 @@ fn candidate(browser: &Browser) {
     browser.press(&['.']);
     browser.wait("document.querySelector('#picked').textContent.startsWith('Atom 0: Al')");
     assert_eq!(browser.run("return document.querySelectorAll('tr[aria-selected=true]').length"), 1);
+    browser.press(&['m', '.']);
+    browser.wait("document.querySelector('#picked').textContent.includes('Å from atom 0')");
 }
 
 /// Drops the first structure of the queue.
