@@ -1,6 +1,7 @@
 //! Errors of the potential for single labelled candidates.
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 
 use atoms::cell::{norm, sub};
 use serde::Serialize;
@@ -53,11 +54,11 @@ impl ErrorReader {
         let Some(row) = found.filter(|row| row.cursor == ExportCursor::Candidate(decision)) else {
             return Ok(None);
         };
-        if !self.offsets.contains_key(&version) {
-            let fit = ProtocolEnergyOffsets::fit(store, protocol, version).await?;
-            self.offsets.insert(version, fit);
-        }
-        Ok(self.offsets.get(&version).and_then(|offsets| errors(&row, offsets)))
+        let offsets = match self.offsets.entry(version) {
+            Entry::Occupied(known) => known.into_mut(),
+            Entry::Vacant(place) => place.insert(ProtocolEnergyOffsets::fit(store, protocol, version).await?),
+        };
+        Ok(errors(&row, offsets))
     }
 }
 

@@ -52,7 +52,7 @@ struct ErrorSums {
 
 impl Parity {
     /// Nothing yet.
-    pub fn new() -> Self {
+    pub(super) fn new() -> Self {
         let none = || ParityErrors { sums: ErrorSums::default(), points: SystematicSample::new(MAX_POINTS) };
         Self { energy: none(), force: none(), stress: none() }
     }
