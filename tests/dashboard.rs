@@ -158,6 +158,12 @@ fn check_table(live: &Live) {
     let expected = |line: &&Value| line["gamma"].as_f64() > Some(1.1) && line["origin"] == "biased";
     assert_eq!(found, all.iter().filter(expected).cloned().collect::<Vec<_>>());
     assert_eq!(all_lines(address, "where=energy+%3C+1", 4), Vec::<Value>::new(), "there is no label");
+    let file = get(address, "/api/candidates.extxyz?state=queued&ascending=true");
+    let frames: Vec<_> = ExtxyzReader::new(file.body.as_bytes()).map(|frame| frame.unwrap()).collect();
+    let waiting = all_lines(address, "state=queued&ascending=true", 50);
+    let names_of = frames.iter().map(|frame| frame.info["candidate_id"].text().unwrap());
+    assert!(names_of.eq(waiting.iter().map(|line| line["id"].as_str().unwrap())), "{}", file.head);
+    assert!(frames.len() > 2 && frames.iter().all(|frame| !frame.info.contains_key("energy")));
     let wrong = get(address, "/api/candidates?where=gama+%3E+1");
     assert!(
         wrong.status == 400 && wrong.json()["error"].as_str().unwrap().contains("gamma_nbr"),

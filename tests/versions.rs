@@ -224,6 +224,10 @@ fn an_earlier_version_is_registered_again() {
     let lock = CampaignLock::acquire(&here.join("here"), "calmwalk run").unwrap();
     assert!(refuse(here, ["versions", "here", "roll-back", "1"]).contains("is being run by"));
     drop(lock);
+    let before = fs::read(here.join("here/campaign.sqlite")).unwrap();
+    let said = succeed(here, ["versions", "here", "roll-back", "1", "--dry-run"]);
+    assert_eq!(said, "would register version 4: version 1 again\nnothing was changed\n");
+    assert!(fs::read(here.join("here/campaign.sqlite")).unwrap() == before);
     let said = succeed(here, ["versions", "here", "roll-back", "1"]);
     let expected = "registered version 4: version 1 again\nthe next calmwalk run restarts all walks from their seed structures with it\n";
     assert_eq!(said, expected);

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use analysis::{PrincipalAxes, SystematicSample};
 use atoms::Species;
 use calm::drift::condition_number;
-use calm::{Component, Mixture};
+use calm::{Component, Mixture, moments};
 use serde::Serialize;
 
 /// Elements with a plane.
@@ -127,35 +127,6 @@ impl FeaturePlane {
         });
         (all > 0).then(|| found.sum::<f64>() / all as f64)
     }
-}
-
-/// Mean and covariance of the data of several components, `[D]` and `[D × D]`, with the centroids as means. `None` without statistics or
-/// data.
-fn moments(components: &[Arc<Component>]) -> Option<(Vec<f64>, Vec<f64>)> {
-    let statistics: Vec<_> =
-        components.iter().map(|component| component.statistics()).collect::<Option<_>>()?;
-    let total: f64 = statistics.iter().map(|of| of.effective_count).sum();
-    let dimension = components.first()?.dimension();
-    if total <= 0.0 || dimension < 2 {
-        return None;
-    }
-    let mut mean = vec![0.0; dimension];
-    for (component, of) in components.iter().zip(&statistics) {
-        let weight = of.effective_count / total;
-        mean.iter_mut().zip(component.centroid()).for_each(|(mean, x)| *mean += weight * x);
-    }
-    let mut covariance = vec![0.0; dimension * dimension];
-    for (component, of) in components.iter().zip(&statistics) {
-        let weight = of.effective_count / total;
-        let offset: Vec<_> = component.centroid().iter().zip(&mean).map(|(x, mean)| x - mean).collect();
-        let rows = covariance.chunks_exact_mut(dimension).zip(of.scatter.chunks_exact(dimension));
-        for ((sums, scatter), x) in rows.zip(&offset) {
-            for ((sum, scatter), y) in sums.iter_mut().zip(scatter).zip(&offset) {
-                *sum += scatter / total + weight * x * y;
-            }
-        }
-    }
-    Some((mean, covariance))
 }
 
 /// The first two numbers, of which there must be two.

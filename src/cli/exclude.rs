@@ -30,6 +30,9 @@ pub struct ExcludeArgs {
     /// List the excluded labels
     #[arg(long, conflicts_with_all = ["ids", "reason", "undo"])]
     list: bool,
+    /// Only show what would be changed
+    #[arg(long, conflicts_with = "list")]
+    dry_run: bool,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -53,7 +56,10 @@ impl ExcludeArgs {
             }
             return Ok(ExitStatus::Done);
         }
-        let changes = block_on(self.change())??;
+        let changes = match self.dry_run {
+            true => block_on(self.planned())??,
+            false => block_on(self.change())??,
+        };
         if self.json {
             print_json(&changes)?;
         } else {
@@ -67,6 +73,13 @@ impl ExcludeArgs {
         let excluded = store.excluded().await?;
         store.close().await;
         Ok(excluded)
+    }
+
+    async fn planned(&self) -> Result<Vec<ExclusionChange>, CommandError> {
+        let store = Store::open_read_only(&self.location.get()?).await?;
+        let changes = store.exclusion_changes(&self.ids, self.reason.as_deref()).await?;
+        store.close().await;
+        Ok(changes)
     }
 
     async fn change(&self) -> Result<Vec<ExclusionChange>, CommandError> {
@@ -86,6 +99,12 @@ impl ExcludeArgs {
         let ExclusionChange { id, protocols, changed, excluded } = change;
         let protocols = protocols.iter().map(|name| format!("'{name}'")).collect::<Vec<_>>().join(", ");
         match (excluded, changed) {
+            (Some(_), true) if self.dry_run => {
+                format!("{id}: label of {protocols} would be excluded; nothing was changed")
+            }
+            (None, true) if self.dry_run => {
+                format!("{id}: label of {protocols} would be included again; nothing was changed")
+            }
             (Some(_), true) => format!(
                 "{id}: label of {protocols} excluded from exports and statistics (undo with --undo, replace with calmwalk \
                  relabel)"

@@ -28,6 +28,9 @@ pub struct LowerStatesArgs {
     /// Remark, stored with the reason of the superseded labels; needs IDs or --all
     #[arg(long, value_name = "TEXT")]
     reason: Option<String>,
+    /// Only show what IDs or --all would change
+    #[arg(long)]
+    dry_run: bool,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -40,13 +43,14 @@ impl LowerStatesArgs {
             if self.json {
                 print_json(&changes)?
             } else {
-                print(|out| write_changes(out, &changes))?
+                print(|out| write_changes(out, &changes, self.dry_run))?
             }
             return Ok(ExitStatus::Done);
         }
-        if self.reason.is_some() {
-            let message = "--reason needs IDs or --all: without them, nothing is changed";
-            return Err(CommandError::Input(message.to_owned()));
+        let useless = [("--reason", self.reason.is_some()), ("--dry-run", self.dry_run)];
+        if let Some((option, _)) = useless.into_iter().find(|(_, is_given)| *is_given) {
+            let message = format!("{option} needs IDs or --all: without them, nothing is changed");
+            return Err(CommandError::Input(message));
         }
         let states = block_on(self.read())??;
         if self.json {
@@ -66,9 +70,15 @@ impl LowerStatesArgs {
 
     async fn take(&self) -> Result<Vec<LowerStateChange>, CommandError> {
         let location = self.location.get()?;
+        let ids = (!self.all).then_some(self.ids.as_slice());
+        if self.dry_run {
+            let store = Store::open_read_only(&location).await?;
+            let changes = store.lower_state_changes(ids).await?;
+            store.close().await;
+            return Ok(changes);
+        }
         warn_if_unencrypted(&location);
         let store = Store::open(&location).await?;
-        let ids = (!self.all).then_some(self.ids.as_slice());
         let reason = self.reason.as_deref().map(str::trim).filter(|reason| !reason.is_empty());
         let changes = store.take_lower_states(ids, reason, unix_milliseconds()).await?;
         store.close().await;
@@ -110,16 +120,20 @@ fn write_list(out: &mut dyn Write, states: &[LowerState]) -> io::Result<()> {
     table.write(out)
 }
 
-fn write_changes(out: &mut dyn Write, changes: &[LowerStateChange]) -> io::Result<()> {
+fn write_changes(out: &mut dyn Write, changes: &[LowerStateChange], dry_run: bool) -> io::Result<()> {
     if changes.is_empty() {
         return writeln!(out, "every label is the lowest known state of its structure: nothing was changed");
     }
     for LowerStateChange { id, taken } in changes {
         for LowerState { protocol, difference_per_atom, lower, .. } in taken {
             let source = &lower.source;
+            let (is, then) = match dry_run {
+                true => ("would be", "nothing was changed"),
+                false => ("is now", "the label before is superseded"),
+            };
             writeln!(
                 out,
-                "{id}: label of '{protocol}' is now the result of {source}, lower by {:.6} eV/atom; the label before is superseded",
+                "{id}: label of '{protocol}' {is} the result of {source}, lower by {:.6} eV/atom; {then}",
                 -difference_per_atom
             )?;
         }

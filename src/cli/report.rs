@@ -2,11 +2,12 @@
 
 use std::path::PathBuf;
 
+use serde_json::json;
 use store::Store;
 
 use super::force_errors::check_version;
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
-use crate::output::{count, print};
+use crate::output::{count, print, print_json};
 use crate::page::{create_directory, write_files};
 use crate::report::{self, PAGE};
 
@@ -27,6 +28,9 @@ pub struct ReportArgs {
     /// with labels]
     #[arg(long, value_name = "N")]
     version: Option<u32>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
 }
 
 impl ReportArgs {
@@ -45,6 +49,11 @@ impl ReportArgs {
         })??;
         write_files(&self.output, &files)?;
         let page = self.output.join(PAGE);
+        if self.json {
+            let names: Vec<_> = files.iter().map(|file| &file.path).collect();
+            print_json(&json!({ "page": page, "directory": self.output, "files": names }))?;
+            return Ok(ExitStatus::Done);
+        }
         print(|out| {
             writeln!(
                 out,

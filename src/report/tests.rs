@@ -197,7 +197,7 @@ async fn figures_have_the_numbers_of_the_store() {
     }
     label_all(&store).await;
     let files = build(&store, None).await.unwrap();
-    assert_eq!(files.iter().filter(|file| file.path.ends_with(".png")).count(), 9);
+    assert_eq!(files.iter().filter(|file| file.path.ends_with(".png")).count(), 10);
     for svg in files.iter().filter(|file| file.path.ends_with(".svg")) {
         words(std::str::from_utf8(&svg.bytes).unwrap());
     }
@@ -205,10 +205,18 @@ async fn figures_have_the_numbers_of_the_store() {
     words(page);
     are_on_the_page(&files);
     assert!(
-        !page.contains("http://") || page.matches("http://").count() == 9,
+        !page.contains("http://") || page.matches("http://").count() == 10,
         "only names of SVG's elements"
     );
     assert!(!page.contains("https://") && page.contains("[walk]") && page.contains("tau"));
+
+    // Errors of 0.1 to 0.8 eV/Å along x: 3.6 / 24 and √(2.04 / 24).
+    let said = words(page).replace('\u{a0}', "");
+    for expected in ["force: MAE 0.1500, RMSE 0.2915 eV/Å over 1920 components", "stress: none known"] {
+        assert!(said.contains(expected), "{expected}: {said}");
+    }
+    let parity = file(&files, "figures/parity.csv");
+    assert!(parity.lines().filter(|row| row.starts_with("b,control,")).count() == 960, "{parity:.300}");
 
     // Eight atoms of each of 80 structures. The grades 1.2, 1.4 and 1.6 have half of that as error.
     let correlations = file(&files, "tables/correlations.csv");

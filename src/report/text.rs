@@ -47,6 +47,7 @@ fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [PageTa
                 numbered("features"),
             ]),
         ),
+        ("The potential against labels", blocks(vec![numbered("parity")])),
         (
             "Force errors by grade",
             blocks(vec![

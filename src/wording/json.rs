@@ -32,10 +32,11 @@ pub fn force_errors(statistics: &LabelStatistics, protocol: &Protocol) -> Value 
     json
 }
 
-/// The same for the page of errors of the dashboard, with the names of what it shows.
+/// The same for the page of errors of the dashboard, with the names of what it shows, and values beside those of labels.
 pub fn force_errors_for_page(statistics: &LabelStatistics, protocol: &Protocol) -> Value {
     let mut json = force_errors(statistics, protocol);
     json["biased_against_control"]["shown"] = comparison::shown();
+    json["parity"] = json!(statistics.parity);
     json
 }
 

@@ -16,6 +16,7 @@ pub mod history;
 pub mod json;
 pub mod label_progress;
 pub mod labels;
+pub mod parity;
 pub mod reference_check;
 pub mod unlabelled;
 pub mod upfit;

@@ -30,6 +30,14 @@ impl Store {
         }
     }
 
+    /// Number of declined candidates with features.
+    pub async fn declined_features(&self) -> Result<u64> {
+        let with = "SELECT count(*) FROM candidate CROSS JOIN candidate_data
+                    ON candidate_data.decision = candidate.decision
+                    WHERE fate = 'declined' AND features IS NOT NULL";
+        query(with).fetch_one(&self.database).await
+    }
+
     /// Deletes the features of declined candidates, which only a replay with other rules needs. The caller holds
     /// the [`crate::CampaignLock`]. Returns the number of candidates.
     pub async fn drop_declined_features(&self, now: i64) -> Result<u64> {

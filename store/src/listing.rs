@@ -74,6 +74,8 @@ pub struct ListedCandidate {
     pub value: Option<f64>,
     /// The factors of the value, a JSON object.
     pub value_factors: Option<serde_json::Value>,
+    /// Energy by the potential of its walk, eV.
+    pub potential_energy: Option<f64>,
     /// Energy of its structure's label under that job's protocol, eV; `None` without a label, or if the label is
     /// excluded.
     pub energy: Option<f64>,

@@ -37,8 +37,25 @@ pub fn request(address: &str, method: &str, path: &str, headers: &[(&str, &str)]
     // Some servers keep the connection open.
     let mut body = String::new();
     stream.take(length.unwrap_or(u64::MAX)).read_to_string(&mut body).expect("a body");
+    if head.to_ascii_lowercase().contains("transfer-encoding: chunked") {
+        body = joined_chunks(&body);
+    }
     let status = head.split(' ').nth(1).and_then(|status| status.parse().ok()).expect("a status");
     Answer { status, head, body }
+}
+
+/// The content of a chunked body (RFC 9112, 7.1).
+fn joined_chunks(mut body: &str) -> String {
+    let mut joined = String::new();
+    loop {
+        let (size, rest) = body.split_once("\r\n").expect("the size of a chunk");
+        let size = usize::from_str_radix(size, 16).expect("a hexadecimal size");
+        if size == 0 {
+            return joined;
+        }
+        joined.push_str(&rest[..size]);
+        body = &rest[size + 2..];
+    }
 }
 
 /// Sends a GET request.

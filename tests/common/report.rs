@@ -30,8 +30,17 @@ pub fn check(here: &Path, campaign: &str, status: &Value, errors: &Value) {
     assert!(files > 25, "{files} files");
 
     let page = text("report.html");
-    for name in ["collection", "distributions", "errors", "space", "features", "grades", "completion", "cost"]
-    {
+    for name in [
+        "collection",
+        "distributions",
+        "errors",
+        "space",
+        "features",
+        "parity",
+        "grades",
+        "completion",
+        "cost",
+    ] {
         assert!(page.contains(&format!("<figure id=\"figure-{name}\">")), "no figure {name}");
         assert!(read(&format!("figures/{name}.png")).starts_with(b"\x89PNG"));
     }

@@ -166,7 +166,8 @@ fn narrow(browser: &Browser, page: &str, id: &str) {
     for (name, is_there) in [
         ("candidates", "document.querySelectorAll('.candidates tbody tr').length > 2"),
         ("mixture", "document.querySelector('button.pick[aria-pressed=true]')"),
-        ("errors", "document.querySelectorAll('figure svg[role=img]').length === 3"),
+        ("errors", "document.querySelectorAll('figure svg[role=img]').length === 6"),
+        ("map", "document.querySelectorAll('.map svg a').length > 4"),
         ("hosts", "document.querySelector('main p, main table')"),
         (&format!("candidate/{id}"), "document.querySelectorAll('.atoms tbody tr').length > 20"),
         ("walk/0", "document.querySelectorAll('figure svg[role=img]').length === 8"),
@@ -192,7 +193,7 @@ fn fits(browser: &Browser, url: &str, is_there: &str) {
 }
 
 fn errors(browser: &Browser) {
-    browser.wait("document.querySelectorAll('figure svg[role=img]').length === 3");
+    browser.wait("document.querySelectorAll('figure svg[role=img]').length === 6");
     let text = browser.run("return document.querySelector('main').textContent");
     let text = text.as_str().unwrap();
     for words in [
@@ -202,6 +203,8 @@ fn errors(browser: &Browser) {
         "Biased against control",
         "median (eV/Å)",
         "Labels by V/V₀",
+        "RMSE",
+        "meV per atom",
     ] {
         assert!(text.contains(words), "{words}: {text}");
     }
@@ -257,6 +260,8 @@ fn candidate(browser: &Browser) {
     browser.press(&['.']);
     browser.wait("document.querySelector('#picked').textContent.startsWith('Atom 0: Al')");
     assert_eq!(browser.run("return document.querySelectorAll('tr[aria-selected=true]').length"), 1);
+    browser.press(&['m', '.']);
+    browser.wait("document.querySelector('#picked').textContent.includes('Å from atom 0')");
 }
 
 /// Drops the first structure of the queue.

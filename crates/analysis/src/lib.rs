@@ -49,7 +49,7 @@ pub use group_sample::GroupSample;
 pub use histogram::{Histogram, decade_edges, linear_edges, logarithmic_edges};
 pub use logistic::logistic_regression;
 pub use offsets::{ElementOffset, EnergyOffsets, LabelledEnergy, TooFewLabels};
-pub use principal::PrincipalAxes;
+pub use principal::{PrincipalAxes, row_moments};
 pub use quantiles::quantile;
 pub use rank_statistics::{roc_auc, spearman};
 pub use ranked_errors::{RankStatistics, RankedErrors};

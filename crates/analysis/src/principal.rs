@@ -24,14 +24,9 @@ impl PrincipalAxes {
         if count < 2 || number > dimension || !rows.iter().all(|x| x.is_finite()) {
             return None;
         }
-        let mut mean = vec![0.0; dimension];
-        for row in rows.chunks_exact(dimension) {
-            mean.iter_mut().zip(row).for_each(|(mean, x)| *mean += x / count as f64);
-        }
-        let centred = Mat::from_fn(count, dimension, |row, k| rows[row * dimension + k] - mean[k]);
-        let covariance = centred.transpose() * &centred;
+        let (mean, scatter) = mean_and_scatter(rows, dimension);
         let size = count as f64 * mean.iter().map(|x| x * x).sum::<f64>();
-        Self::of_covariance(mean, covariance.as_ref(), size, number)
+        Self::of_covariance(mean, scatter.as_ref(), size, number)
     }
 
     /// The first `number` axes of data with this mean and this symmetric covariance, `[dimension × dimension]`, such as
@@ -91,6 +86,29 @@ impl PrincipalAxes {
     }
 }
 
+/// Mean and covariance of rows of `dimension` finite numbers, `[D]` and `[D × D]`. `None` without rows.
+pub fn row_moments(rows: &[f64], dimension: usize) -> Option<(Vec<f64>, Vec<f64>)> {
+    let count = rows.len().checked_div(dimension).filter(|count| *count > 0)?;
+    if !rows.iter().all(|x| x.is_finite()) {
+        return None;
+    }
+    let (mean, scatter) = mean_and_scatter(rows, dimension);
+    let element = |k: usize| scatter[(k / dimension, k % dimension)] / count as f64;
+    Some((mean, (0..dimension * dimension).map(element).collect()))
+}
+
+/// The mean of the rows, and the sum of the outer products of their deviations from it.
+fn mean_and_scatter(rows: &[f64], dimension: usize) -> (Vec<f64>, Mat<f64>) {
+    let count = rows.len() / dimension;
+    let mut mean = vec![0.0; dimension];
+    for row in rows.chunks_exact(dimension) {
+        mean.iter_mut().zip(row).for_each(|(mean, x)| *mean += x / count as f64);
+    }
+    let centred = Mat::from_fn(count, dimension, |row, k| rows[row * dimension + k] - mean[k]);
+    let scatter = centred.transpose() * &centred;
+    (mean, scatter)
+}
+
 fn with_fixed_sign(mut axis: Vec<f64>) -> Vec<f64> {
     let largest =
         axis.iter().copied().fold(0.0, |largest: f64, x| if x.abs() > largest.abs() { x } else { largest });
@@ -144,6 +162,9 @@ mod tests {
         let trace = covariance[0] + covariance[4] + covariance[8];
         let diagonal = [found.shares[0] * trace, 0.0, 0.0, found.shares[1] * trace];
         assert!(near(&found.project_covariance(&covariance), &diagonal));
+        let (own_mean, own_covariance) = row_moments(&rows, 3).unwrap();
+        assert!(near(&own_mean, &mean) && near(&own_covariance, &covariance), "{own_covariance:?}");
+        assert_eq!((row_moments(&[], 3), row_moments(&[1.0, f64::NAN], 2)), (None, None));
         assert_eq!(PrincipalAxes::from_covariance(mean, &[0.0; 9], 2), None, "no variance");
         assert_eq!(PrincipalAxes::from_covariance(vec![0.0; 2], &covariance, 2), None, "another size");
     }

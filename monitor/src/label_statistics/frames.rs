@@ -197,21 +197,30 @@ impl ComparedFrames {
     }
 }
 
-/// Root mean square difference of the six components of the stress, eV/Å³. `None` unless the structure is periodic in three
-/// directions.
-fn stress_error(structure: &Structure, virial: Matrix3, label: Matrix3) -> Option<f64> {
+/// The six components of the stress by the model and by the label, eV/Å³. `None` unless the structure is periodic in three directions.
+pub(super) fn stress_components(
+    structure: &Structure,
+    virial: Matrix3,
+    label: Matrix3,
+) -> Option<[[f64; 2]; 6]> {
     let volume = structure.cell.volume();
     if structure.periodic != [true; 3] || volume <= 0.0 {
         return None;
     }
-    let difference = |i: usize, j: usize| -virial[i][j] / volume - label[i][j];
-    let components = (0..3).flat_map(|i| (0..=i).map(move |j| (i, j)));
-    let squares = components.map(|(i, j)| (0.5 * (difference(i, j) + difference(j, i))).powi(2));
-    mean(squares).map(f64::sqrt)
+    let symmetric = |of: &Matrix3, i: usize, j: usize| 0.5 * (of[i][j] + of[j][i]);
+    let component = |(i, j)| [-symmetric(&virial, i, j) / volume, symmetric(&label, i, j)];
+    Some([(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)].map(component))
+}
+
+/// Root mean square difference of the six components of the stress, eV/Å³. `None` unless the structure is periodic in three
+/// directions.
+pub(crate) fn stress_error(structure: &Structure, virial: Matrix3, label: Matrix3) -> Option<f64> {
+    let components = stress_components(structure, virial, label)?;
+    mean(components.iter().map(|[model, label]| (model - label).powi(2))).map(f64::sqrt)
 }
 
 /// Mean of finite values; `None` without values, or with one that is not finite.
-pub(super) fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
+pub(crate) fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
     let (number, sum) = values.fold((0_u64, 0.0), |(number, sum), x| (number + 1, sum + x));
     let mean = sum / number as f64;
     mean.is_finite().then_some(mean)

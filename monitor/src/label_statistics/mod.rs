@@ -2,8 +2,9 @@
 //! structures have no label.
 
 pub mod comparison;
-mod frames;
+pub(crate) mod frames;
 mod json;
+pub mod parity;
 #[cfg(test)]
 mod tests;
 
@@ -20,6 +21,7 @@ use wire::{ContentHash, Origin};
 
 use self::comparison::{COMPARISON_BOOTSTRAP, WalkComparison};
 use self::frames::ComparedFrames;
+use self::parity::Parity;
 use crate::energy_errors::{EnergyErrors, ProtocolEnergyOffsets};
 use crate::versions::newest_with_labels;
 
@@ -61,6 +63,8 @@ pub struct LabelStatistics {
     pub control: ErrorsByGrade,
     /// Energy errors of all structures.
     pub energies: EnergyErrors,
+    /// Energies, forces and stresses of the potential beside those of the labels.
+    pub parity: Parity,
     /// Labelled structures that both a biased walk and a control walk found, for example before the bias separates
     /// them. `all` counts them once, and the comparison excludes them.
     pub shared: u64,
@@ -90,6 +94,7 @@ pub async fn read(
         biased: ErrorsByGrade::new(MAX_SAMPLES),
         control: ErrorsByGrade::new(MAX_SAMPLES),
         energies: EnergyErrors::new(ProtocolEnergyOffsets::fit(store, protocol, version).await?),
+        parity: Parity::new(),
         shared: 0,
         by_gamma: Completion::new(Bins::for_grades()),
         by_expansion: Completion::new(Bins::for_volume_ratio()),
@@ -154,8 +159,8 @@ impl LabelStatistics {
         let errors = view.forces.iter().zip(&row.label.forces);
         let errors: Vec<_> = errors.map(|(model, label)| norm(sub(*model, *label))).collect();
         let (of, is_shared) = (versions.version_of(view.id().walk.0), shared.contains(&view.id().content));
+        let error = self.energies.error_per_atom(&row.structure, view.energy(), row.label.energy);
         if of == version {
-            let error = self.energies.error_per_atom(&row.structure, view.energy(), row.label.energy);
             self.compared.add(row, is_shared, error);
         }
         if is_shared && *origin == Origin::Control {
@@ -176,6 +181,7 @@ impl LabelStatistics {
             }
         }
         self.energies.add(&row.structure, view.energy(), row.label.energy);
+        self.parity.add(row, error);
     }
 
     fn of_version(&mut self, version: u32) -> &mut ErrorsByGrade {

@@ -4,11 +4,12 @@ mod draw;
 mod split;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::Write;
+use std::io::{self, Write};
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use atoms::extxyz::{Frame, LabelKeys, write_frame};
+use serde_json::{Value, json};
 use store::records::Protocol;
 use store::{DATABASE, ExportCursor, ExportFilter, ExportRow, ExportSource, JobState, LOCK, Store};
 use wire::{WalkConditions, WalkId};
@@ -19,7 +20,7 @@ use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::export_frame;
 use crate::filter::StructureFilter;
-use crate::output::{self, Bar, print};
+use crate::output::{self, Bar, print, print_json};
 
 /// Structures per read.
 const PAGE: u32 = 200;
@@ -92,6 +93,9 @@ pub struct ExportArgs {
     /// Export the labels of this protocol; required if there are labels of several protocols
     #[arg(long, value_name = "NAME")]
     protocol: Option<String>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
 }
 
 #[derive(Clone, Copy, Debug, clap::ValueEnum)]
@@ -124,6 +128,13 @@ struct Exported {
     others: u64,
     /// With `--per-walk`.
     drawn: Option<Drawn>,
+}
+
+/// Accepted structures that have no label.
+struct WithoutLabel {
+    waiting: u64,
+    failed: u64,
+    dropped: u64,
 }
 
 /// A file to write.
@@ -162,8 +173,8 @@ async fn check_completeness(
 
 impl ExportArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
-        let Exported { counts, labels, others, drawn } = block_on(self.export())??;
-        for (path, count, _) in &counts {
+        let exported = block_on(self.export())??;
+        for (path, count, _) in &exported.counts {
             if matches!(self.keys, KeyNames::Grace) && (1..count.frames).contains(&count.without_stress) {
                 let (without, frames, path) = (count.without_stress, count.frames, path.display());
                 let warning = "have no stress: gracemaker will ignore the stress of the whole file";
@@ -171,53 +182,46 @@ impl ExportArgs {
                     writeln!(std::io::stderr(), "{without} of the {frames} structures in {path} {warning}");
             }
         }
-        print(|out| {
-            for (path, count, assigned) in &counts {
-                let from = if self.split.is_none() {
-                    String::new()
-                } else {
-                    format!(
-                        ", from {} of the {assigned} seed structures assigned to it",
-                        count.seed_structures.len()
-                    )
-                };
-                writeln!(out, "{} in {}{from}", output::count(count.frames, "structure"), path.display())?;
-            }
-            if let Some(drawn) = &drawn {
-                drawn.write(out)?;
-            }
-            if others > 0 {
-                let others = output::count(others, "structure");
-                writeln!(
-                    out,
-                    "not exported: {others} with labels of other protocols (select with --protocol)"
-                )?;
-            }
-            let store::LabelJobCounts {
-                queued,
-                leased,
-                failed,
-                dropped,
-                relabelling,
-                failed_under_new_protocol,
-                excluded,
-                ..
-            } = labels;
-            if excluded > 0 {
-                writeln!(out, "not exported: {excluded} with excluded labels (see calmwalk exclude --list)")?;
-            }
-            // Structures that wait for a replacement label have a label.
-            let waiting = (queued + leased).saturating_sub(relabelling);
-            let failed = failed.saturating_sub(failed_under_new_protocol);
-            if waiting + failed + dropped == 0 {
-                return writeln!(out, "all accepted structures are labelled");
-            }
-            writeln!(
-                out,
-                "accepted structures without a label: {waiting} not labelled yet, {failed} failed, {dropped} dropped"
-            )
-        })?;
+        if self.json {
+            print_json(&exported.as_json())?;
+        } else {
+            print(|out| self.write(out, &exported))?;
+        }
         Ok(ExitStatus::Done)
+    }
+
+    fn write(&self, out: &mut dyn Write, exported: &Exported) -> io::Result<()> {
+        for (path, count, assigned) in &exported.counts {
+            let from = if self.split.is_none() {
+                String::new()
+            } else {
+                format!(
+                    ", from {} of the {assigned} seed structures assigned to it",
+                    count.seed_structures.len()
+                )
+            };
+            writeln!(out, "{} in {}{from}", output::count(count.frames, "structure"), path.display())?;
+        }
+        if let Some(drawn) = &exported.drawn {
+            drawn.write(out)?;
+        }
+        if exported.others > 0 {
+            let others = output::count(exported.others, "structure");
+            writeln!(out, "not exported: {others} with labels of other protocols (select with --protocol)")?;
+        }
+        let missing = WithoutLabel::of(&exported.labels);
+        let excluded = exported.labels.excluded;
+        if excluded > 0 {
+            writeln!(out, "not exported: {excluded} with excluded labels (see calmwalk exclude --list)")?;
+        }
+        let WithoutLabel { waiting, failed, dropped } = missing;
+        if waiting + failed + dropped == 0 {
+            return writeln!(out, "all accepted structures are labelled");
+        }
+        writeln!(
+            out,
+            "accepted structures without a label: {waiting} not labelled yet, {failed} failed, {dropped} dropped"
+        )
     }
 
     async fn export(&self) -> Result<Exported, CommandError> {
@@ -367,6 +371,32 @@ impl ExportArgs {
              dropped, {excluded} excluded){imported}",
             queued + leased
         )
+    }
+}
+
+impl Exported {
+    fn as_json(&self) -> Value {
+        let file = |(path, count, assigned): &(PathBuf, Count, usize)| {
+            json!({
+                "path": path, "structures": count.frames, "without_stress": count.without_stress,
+                "seed_structures": count.seed_structures.len(), "assigned_seed_structures": assigned,
+            })
+        };
+        let WithoutLabel { waiting, failed, dropped } = WithoutLabel::of(&self.labels);
+        json!({
+            "files": self.counts.iter().map(file).collect::<Vec<_>>(), "other_protocols": self.others,
+            "excluded": self.labels.excluded,
+            "without_label": { "waiting": waiting, "failed": failed, "dropped": dropped },
+        })
+    }
+}
+
+impl WithoutLabel {
+    fn of(labels: &store::LabelJobCounts) -> Self {
+        // Structures that wait for a replacement label have a label.
+        let waiting = (labels.queued + labels.leased).saturating_sub(labels.relabelling);
+        let failed = labels.failed.saturating_sub(labels.failed_under_new_protocol);
+        Self { waiting, failed, dropped: labels.dropped }
     }
 }
 

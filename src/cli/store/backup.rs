@@ -2,11 +2,12 @@
 
 use std::path::PathBuf;
 
+use serde_json::json;
 use store::{DATABASE, Store, unix_milliseconds};
 
 use super::{CampaignArgs, CommandError, ExitStatus};
 use crate::cli::block_on;
-use crate::output::{Bar, print};
+use crate::output::{Bar, print, print_json};
 use crate::wording::disk::megabytes;
 
 const BAR: &str = "copying {bar:32} {percent} %  {eta} left";
@@ -23,6 +24,9 @@ pub struct StoreBackupArgs {
     /// Directory of the backup; it must not exist
     #[arg(value_name = "TARGET")]
     target: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
 }
 
 impl StoreBackupArgs {
@@ -30,6 +34,10 @@ impl StoreBackupArgs {
         block_on(self.backup())??;
         let target = self.target.display();
         let size = std::fs::metadata(self.target.join(DATABASE)).map_or(0, |file| file.len());
+        if self.json {
+            print_json(&json!({ "target": self.target, "bytes": size }))?;
+            return Ok(ExitStatus::Done);
+        }
         print(|out| writeln!(out, "backed up to {target}, {}", megabytes(size)))?;
         Ok(ExitStatus::Done)
     }

@@ -1,11 +1,14 @@
 //! `calmwalk store check`
 
+use std::io::Write;
+
 use calm::Component;
+use serde_json::json;
 use store::{ComponentRecord, Finding, Store, StoreError};
 
 use super::{CampaignArgs, CommandError, ExitStatus};
 use crate::cli::block_on;
-use crate::output::{Bar, print};
+use crate::output::{Bar, print, print_json};
 
 const BAR: &str = "checking {bar:32} {pos}/{len} rows  {eta} left";
 
@@ -27,15 +30,26 @@ const BAR: &str = "checking {bar:32} {pos}/{len} rows  {eta} left";
 pub struct StoreCheckArgs {
     #[command(flatten)]
     location: CampaignArgs,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
 }
 
 impl StoreCheckArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         let (findings, rows) = block_on(self.check())??;
-        print(|out| {
+        if self.json {
+            let problems =
+                findings.iter().map(|Finding { what, then }| json!({ "what": what, "then": then }));
+            print_json(&json!({ "rows": rows, "problems": problems.collect::<Vec<_>>() }))?;
+        }
+        let print_text = |out: &mut dyn Write| {
             findings.iter().try_for_each(|finding| writeln!(out, "{finding}"))?;
             if findings.is_empty() { writeln!(out, "no problems found in {rows} rows") } else { Ok(()) }
-        })?;
+        };
+        if !self.json {
+            print(print_text)?;
+        }
         match findings.len() {
             0 => Ok(ExitStatus::Done),
             found => Err(CommandError::Failed(format!("{found} findings in {}", self.location.get()?))),

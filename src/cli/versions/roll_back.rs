@@ -42,6 +42,9 @@ pub struct VersionsRollBackArgs {
     /// Number of the version to go back to; 0 is the potential of the configuration
     #[arg(value_name = "N")]
     number: u32,
+    /// Only show what would be registered
+    #[arg(long)]
+    dry_run: bool,
     #[command(flatten)]
     moved: RelocatedFilesArgs,
 }
@@ -72,9 +75,11 @@ impl VersionsRollBackArgs {
         if json {
             let Updates { applied, covered, left_out } = done.updates;
             let candidates = json!({ "applied": applied, "covered": covered, "left_out": left_out });
-            print_json(&json!({ "version": done.number, "parent": self.number, "candidates": candidates }))?;
+            print_json(&json!({
+                "version": done.number, "parent": self.number, "candidates": candidates, "dry_run": self.dry_run,
+            }))?;
         } else {
-            print(|out| done.write(out, self.number))?;
+            print(|out| done.write(out, self.number, self.dry_run))?;
         }
         Ok(ExitStatus::Done)
     }
@@ -85,7 +90,10 @@ impl VersionsRollBackArgs {
         location: &Location,
         stop: &CancellationToken,
     ) -> Result<Option<RolledBack>, CommandError> {
-        let store = Store::open(location).await?;
+        let store = match self.dry_run {
+            true => Store::open_read_only(location).await?,
+            false => Store::open(location).await?,
+        };
         let done = self.register(&store, location, stop).await;
         store.close().await;
         done
@@ -103,8 +111,10 @@ impl VersionsRollBackArgs {
             false => CampaignMode::Reproducible,
         };
         let _lock = match mode {
-            CampaignMode::Reproducible => Some(CampaignLock::acquire_at(location, HOLDER).await?),
-            CampaignMode::Live => None,
+            CampaignMode::Reproducible if !self.dry_run => {
+                Some(CampaignLock::acquire_at(location, HOLDER).await?)
+            }
+            CampaignMode::Reproducible | CampaignMode::Live => None,
         };
         let known = KnownVersions::read(store).await?;
         refuse_newest(&known, number)?;
@@ -133,7 +143,9 @@ impl VersionsRollBackArgs {
             core_hours: 0.0,
             time: unix_milliseconds(),
         };
-        store.add_version(&record, Some(&files)).await?;
+        if !self.dry_run {
+            store.add_version(&record, Some(&files)).await?;
+        }
         Ok(Some(RolledBack { number: record.number, mode, updates }))
     }
 }
@@ -203,10 +215,11 @@ fn read(path: &Path) -> Result<Vec<u8>, CommandError> {
 }
 
 impl RolledBack {
-    fn write(&self, out: &mut dyn Write, again: u32) -> io::Result<()> {
+    fn write(&self, out: &mut dyn Write, again: u32, dry_run: bool) -> io::Result<()> {
         let Self { number, mode, updates } = self;
         let Updates { applied, covered, left_out } = *updates;
-        writeln!(out, "registered version {number}: version {again} again")?;
+        let registered = if dry_run { "would register" } else { "registered" };
+        writeln!(out, "{registered} version {number}: version {again} again")?;
         let all = applied + covered + left_out;
         if all > 0 {
             let left_out = match left_out {
@@ -218,6 +231,9 @@ impl RolledBack {
                 out,
                 "{all} accepted since: {applied} updated its mixture, {covered} covered already{left_out}"
             )?;
+        }
+        if dry_run {
+            return writeln!(out, "nothing was changed");
         }
         match mode {
             CampaignMode::Reproducible => {

@@ -279,6 +279,18 @@ fn a_history_is_shown_if_its_text_view_is_still_open() {
 }
 
 #[test]
+fn the_key_h_shows_the_history_of_the_campaign() {
+    let mut state = state();
+    assert_eq!(press(&mut state, "h"), Some(WatchRequest::History));
+    assert!(screen(&mut state, 80, 24).contains("reading …"));
+    state.complete(Completed::Text(keys::HISTORY.into(), Ok("accepted  12 34".into())));
+    let text = screen(&mut state, 80, 24);
+    assert!(text.contains(keys::HISTORY) && text.contains("accepted  12 34"), "{text}");
+    press(&mut state, "q");
+    assert!(matches!(state.mode, InputMode::Panes));
+}
+
+#[test]
 fn the_last_state_stays_while_the_campaign_cannot_be_read() {
     let mut state = state();
     state.apply(Err(CommandError::Failed("the server is away".into())));

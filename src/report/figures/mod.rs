@@ -9,6 +9,7 @@ mod errors;
 mod grades;
 mod history;
 mod pairs;
+mod parity;
 mod projection;
 mod space;
 mod versions;
@@ -34,6 +35,7 @@ pub fn all(data: &ReportData) -> Vec<FigureEntry> {
         part("errors", "Force errors of new and of stretched structures", errors::draw(&data.collections)),
         part("space", "Volumes and composition", space::draw(&data.collections)),
         part("features", "Feature space", projection::draw(&data.collections)),
+        part("parity", "The potential against labels", parity::draw(data)),
         part("grades", "Force errors by grade", grades::draw(&data.collections)),
         part("error-bounds", "Bounds of the force error", calibration::draw(data)),
         part("history", "The campaign over time", history::draw(data)),

@@ -1,8 +1,10 @@
 //! One candidate or imported structure: its details, its atoms, and files to download.
 
-use atoms::Structure;
+use std::collections::BTreeMap;
+
 use atoms::extxyz::{Column, ColumnData, Frame, FrameLabels, LabelKeys, write_frame};
 use atoms::poscar::write_poscar;
+use atoms::{BOND_FACTOR, Structure};
 use axum::extract::{Path, State};
 use axum::http::{StatusCode, header};
 use axum::response::IntoResponse;
@@ -32,13 +34,16 @@ pub async fn details(State(dashboard): State<Dashboard>, Path(id): Path<String>)
     json(&details.map_err(|error| ApiError::new(StatusCode::INTERNAL_SERVER_ERROR, error))?)
 }
 
-/// `GET /api/candidates/ID/structure`: species, positions and cell (Å).
+/// `GET /api/candidates/ID/structure`: species, positions and cell (Å), and the covalent radius of each element (Å); atoms closer than
+/// `bond_factor` times the sum of their radii are bonded.
 pub async fn structure(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> ApiResult {
     let StructureRecord { id, structure, .. } = find(&dashboard.store, &id).await?;
     let species: Vec<_> = structure.species.iter().map(|species| species.symbol()).collect();
+    let radii: BTreeMap<_, _> =
+        structure.species.iter().map(|species| (species.symbol(), species.covalent_radius())).collect();
     json(&json!({
         "id": id, "species": species, "positions": structure.positions, "cell": structure.cell.0,
-        "periodic": structure.periodic,
+        "periodic": structure.periodic, "radii": radii, "bond_factor": BOND_FACTOR,
     }))
 }
 
@@ -59,6 +64,12 @@ pub async fn poscar(State(dashboard): State<Dashboard>, Path(id): Path<String>) 
     let mut bytes = Vec::new();
     write_poscar(&mut bytes, &structure, &id).map_err(unwritable)?;
     Ok(attachment(&format!("{id}.poscar"), bytes))
+}
+
+/// A structure as [`extxyz`] writes it.
+pub async fn frame_of(store: &Store, id: &str) -> Result<Frame, ApiError> {
+    let found = find(store, id).await?;
+    Ok(frame(store, found).await?)
 }
 
 async fn find(store: &Store, id: &str) -> Result<StructureRecord, ApiError> {

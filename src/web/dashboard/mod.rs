@@ -4,6 +4,7 @@ mod actions;
 mod cache;
 mod candidate;
 mod candidate_table;
+mod feature_map;
 mod force_errors;
 mod history;
 mod mixture;
@@ -38,6 +39,7 @@ pub struct Dashboard {
     feed: StatusFeed,
     errors: CachedResponse,
     mixture: CachedResponse,
+    map: CachedResponse,
     /// The initial mixture, if this process runs the campaign.
     initial: Option<InitialMixture>,
     /// `None` if nothing may be changed.
@@ -47,8 +49,9 @@ pub struct Dashboard {
 impl Dashboard {
     /// Shows the content of `store` and polls it every few seconds.
     pub fn new(store: Store, mutations: Option<Mutations>, initial: Option<InitialMixture>) -> Self {
-        let (errors, mixture) = (CachedResponse::default(), CachedResponse::default());
-        Self { feed: StatusFeed::start(store.clone()), errors, mixture, initial, store, mutations }
+        let feed = StatusFeed::start(store.clone());
+        let [errors, mixture, map] = [(); 3].map(|()| CachedResponse::default());
+        Self { feed, errors, mixture, map, initial, store, mutations }
     }
 
     /// Routes of the dashboard.
@@ -60,6 +63,7 @@ impl Dashboard {
             .route("/api/samples", get(sse::samples))
             .route("/api/history", get(history::history))
             .route("/api/candidates", get(candidate_table::page))
+            .route("/api/candidates.extxyz", get(candidate_table::download::extxyz))
             .route("/api/candidates/{id}", get(candidate::details))
             .route("/api/candidates/{id}/structure", get(candidate::structure))
             .route("/api/candidates/{id}/structure.extxyz", get(candidate::extxyz))
@@ -67,6 +71,7 @@ impl Dashboard {
             .route("/api/candidates/{id}/{action}", post(actions::act_on_job))
             .route("/api/actions", get(actions::action_status))
             .route("/api/errors", get(force_errors::force_errors))
+            .route("/api/map", get(feature_map::feature_map))
             .route("/api/mixture", get(mixture::mixture))
             .route("/api/walks/{walk}/candidates", get(candidates_of_walk))
             .route("/api/walks/{walk}/trace", get(trace_of_walk))

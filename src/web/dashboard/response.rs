@@ -10,7 +10,8 @@ use store::StoreError;
 pub type ApiResult = Result<Response, ApiError>;
 
 /// An error with its message.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, thiserror::Error)]
+#[error("{why}")]
 pub struct ApiError {
     status: StatusCode,
     why: String,

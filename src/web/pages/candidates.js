@@ -4,14 +4,23 @@ import { fetchJson } from "./api.js";
 import { FATES } from "./colours.js";
 import { element, renew, state, words } from "./dom.js";
 import { decimals, labelValue, shortName, whole } from "./format.js";
+import { gallery } from "./gallery.js";
 
 export const TITLE = "Candidates";
 
 const LENGTH = 50;
 const STATES = ["queued", "leased", "labelled", "failed", "dropped", "superseded"];
 /** Columns: title, whether it is numeric, and the sort order of its title. */
-const COLUMNS = [["candidate"], ["decision", true, "decision"], ["fate"], ["label"], ["priority", true, "queue"], ["value", true], ["γ_max", true], ["γ₀_max", true, "gamma"],
-  ["γ₀_nbr", true], ["V/V₀", true, "relative_volume"], ["T", true], ["seed structure"], ["formula"], ["atoms", true], ["E (eV per atom)", true], ["F_max (eV/Å)", true], ["attempts", true]];
+const COLUMNS = [["candidate", false, "walk"], ["decision", true, "decision"], ["fate", false, "fate"], ["label", false, "state"], ["priority", true, "queue"], ["value", true, "value"],
+  ["γ_max", true, "gamma_current"], ["γ₀_max", true, "gamma"], ["γ₀_nbr", true, "gamma_nbr"], ["V/V₀", true, "relative_volume"], ["T", true, "temperature"],
+  ["seed structure", false, "seed_structure"], ["formula", false, "formula"], ["atoms", true, "atoms"],
+  ["E potential (eV per atom)", true, "potential_energy"], ["E label (eV per atom)", true, "energy"], ["ΔE (meV per atom)", true, "energy_error"],
+  ["F MAE (eV/Å)", true, "force_mae"], ["largest ΔF (eV/Å)", true, "max_force_error"], ["ΔStress (GPa)", true, "stress_error"],
+  ["F_max label (eV/Å)", true, "max_force"], ["attempts", true, "attempts"]];
+/** Orders in which large values come first without being asked. */
+const FALLING = ["queue"];
+/** GPa in 1 eV/Å³. */
+const GPA = 160.2176634;
 
 export function show(content, rest, signal) {
   // The query is part of the address, so that it can be bookmarked and shared.
@@ -34,7 +43,7 @@ export function show(content, rest, signal) {
       const page = await fetchPage(params, after, signal, (searched) => {
         if (mine === last) progress.textContent = `${whole(searched)} candidates searched …`;
       }, () => mine !== last);
-      if (mine === last) renew(place, ...lines(page, params, change, pages, after, load));
+      if (mine === last) renew(place, ...lines(page, params, change, pages, after, load, signal));
     } catch (error) {
       if (error.name !== "AbortError" && mine === last) place.replaceChildren(element("p", { class: "wrong", role: "alert" }, error.message));
     } finally {
@@ -45,25 +54,61 @@ export function show(content, rest, signal) {
       }
     }
   };
-  content.append(filters(params, change), progress, place);
+  content.append(filters(params, change), tools(params, change, signal), progress, place);
   return load(null);
 }
 
 /** A filter with few matches takes several requests. */
 async function fetchPage(params, after, signal, onProgress, isStale) {
-  let [found, searched, next, imported] = [[], 0, after, null];
+  let [found, searched, next, imported, sorted] = [[], 0, after, null, null];
   do {
-    const query = new URLSearchParams(params);
+    const query = asked(params);
     query.set("limit", LENGTH - found.length);
     if (next) query.set("after", next);
     const page = await fetchJson(`/api/candidates?${query}`, signal);
-    found = found.concat(page.candidates.map((one, k) => ({ ...one, version: page.versions?.[k] })));
+    found = found.concat(page.candidates.map((one, k) => ({ ...one, version: page.versions?.[k], errors: page.errors[k] })));
     searched += page.scanned;
     imported = page.imported;
+    sorted = page.sorted_among;
     next = page.next;
     if (next && found.length < LENGTH) onProgress(searched);
   } while (next && found.length < LENGTH && !isStale());
-  return { candidates: found, next, imported };
+  return { candidates: found, next, imported, sorted };
+}
+
+/** The parameters that the program knows. */
+function asked(params) {
+  const query = new URLSearchParams(params);
+  query.delete("view");
+  return query;
+}
+
+/** Table or pictures, and the file of what is selected. */
+function tools(params, change, signal) {
+  const said = element("span", { role: "status" });
+  const get = async () => {
+    said.textContent = "collecting …";
+    try {
+      const query = asked(params);
+      // The order of a column without an index is not that of a file.
+      if (!["decision", "gamma", "relative_volume", "queue"].includes(query.get("order") ?? "decision")) ["order", "ascending"].forEach((key) => query.delete(key));
+      const response = await fetch(`/api/candidates.extxyz?${query}`, { signal });
+      if (!response.ok) throw new Error((await response.json().catch(() => ({}))).error ?? `status ${response.status}`);
+      const address = URL.createObjectURL(await response.blob());
+      element("a", { href: address, download: "candidates.extxyz" }).click();
+      setTimeout(() => URL.revokeObjectURL(address), 60000);
+      said.textContent = "saved as candidates.extxyz";
+      said.className = "quiet";
+    } catch (error) {
+      if (error.name === "AbortError") return;
+      said.textContent = error.message;
+      said.className = "wrong";
+    }
+  };
+  const look = element("select", { onchange: (event) => change({ view: event.target.value }) },
+    element("option", { value: "" }, "table"), element("option", { value: "pictures", selected: params.get("view") === "pictures" }, "pictures"));
+  return element("div", { class: "filters" }, element("label", {}, "show as", look),
+    element("button", { type: "button", onclick: get }, "Download what is selected (extended XYZ)"), said);
 }
 
 function filters(params, change) {
@@ -84,15 +129,15 @@ function filters(params, change) {
       "A comparison with a missing value, such as the energy of an unlabelled candidate, is false.")));
 }
 
-function lines({ candidates, next, imported }, params, change, pages, after, load) {
+function lines({ candidates, next, imported, sorted }, params, change, pages, after, load, signal) {
   const order = params.get("order") || "decision";
   const ascending = params.get("ascending") === "true";
   const head = ([title, isNumber, key]) => {
     if (!key) return element("th", { scope: "col", class: isNumber && "number" }, title);
     const isIt = key === order;
-    const turn = () => change({ order: key, ascending: key !== "queue" && isIt && !ascending ? "true" : "" });
-    const sorted = isIt && (key === "queue" ? "descending" : ascending ? "ascending" : "descending");
-    return element("th", { scope: "col", class: isNumber && "number", "aria-sort": sorted },
+    const turn = () => change({ order: key, ascending: !FALLING.includes(key) && isIt && !ascending ? "true" : "" });
+    const way = isIt && (ascending && !FALLING.includes(key) ? "ascending" : "descending");
+    return element("th", { scope: "col", class: isNumber && "number", "aria-sort": way },
       element("button", { type: "button", class: "sort", "data-keep": key, onclick: turn }, title, isIt ? (ascending ? "\u00a0▲" : "\u00a0▼") : ""));
   };
   const back = () => load(pages.pop());
@@ -102,19 +147,30 @@ function lines({ candidates, next, imported }, params, change, pages, after, loa
   };
   // The version of the potential that found a candidate, if there are several: their grades cannot be compared.
   const hasVersions = candidates.some((one) => one.version != null);
-  const columns = hasVersions ? [...COLUMNS, ["version", true]] : COLUMNS;
+  const columns = hasVersions ? [...COLUMNS, ["version", true, "version"]] : COLUMNS;
   const table = element("table", { class: "candidates" }, element("caption", { class: "unseen" }, "Candidates"),
     element("thead", {}, element("tr", {}, columns.map(head))),
     element("tbody", {}, candidates.map((candidate) => line(candidate, columns))));
   const number = pages.length + 1;
+  const isGallery = params.get("view") === "pictures";
   return [
-    element("div", { class: "scrolls", role: "region", tabindex: "0", "aria-label": "Candidates" }, table),
+    isGallery ? gallery(candidates, signal) : element("div", { class: "scrolls", role: "region", tabindex: "0", "aria-label": "Candidates" }, table),
+    sorted && element("p", { class: "quiet" }, sorted.all ? `Sorted: all ${whole(sorted.number)} that match and have a value.`
+      : `Sorted: the newest ${whole(sorted.number)} that match and have a value; older ones are not read. Decision, γ₀_max and V/V₀ sort all.`),
     candidates.length === 0 && element("p", {}, "No candidate matches."),
     imported > 0 && element("p", {}, `Not listed: ${whole(imported)} imported (see calmwalk queue list).`),
     element("p", { class: "turn", role: "status" },
       element("button", { type: "button", "data-keep": "before", disabled: pages.length === 0, onclick: back }, "← previous"),
       ` page ${number} `, element("button", { type: "button", "data-keep": "next", disabled: !next, onclick: on }, "next →")),
   ].filter(Boolean);
+}
+
+function times(factor, value) {
+  return value == null ? null : factor * value;
+}
+
+function perAtom(energy, { atoms }) {
+  return decimals(times(1 / atoms, energy), 4);
 }
 
 function line(candidate, columns) {
@@ -125,6 +181,8 @@ function line(candidate, columns) {
     candidate.priority ?? "–", labelValue(candidate.value), decimals(candidate.selector_gamma, 2), decimals(candidate.gamma, 2),
     decimals(candidate.gamma_nbr, 2),
     decimals(candidate.relative_volume, 4), decimals(candidate.temperature, 0, "K"), candidate.seed_structure, candidate.formula,
-    whole(candidate.atoms), decimals(candidate.energy == null ? null : candidate.energy / candidate.atoms, 4), decimals(candidate.max_force, 3), candidate.attempts ?? "–", whole(candidate.version)];
+    whole(candidate.atoms), perAtom(candidate.potential_energy, candidate), perAtom(candidate.energy, candidate), decimals(times(1000, candidate.errors?.energy), 2),
+    decimals(candidate.errors?.force_mae, 4), decimals(candidate.errors?.max_force_error, 3), decimals(times(GPA, candidate.errors?.stress), 3),
+    decimals(candidate.max_force, 3), candidate.attempts ?? "–", whole(candidate.version)];
   return element("tr", {}, columns.map(([, isNumber], k) => element("td", { class: isNumber && "number" }, cells[k])));
 }

@@ -6,6 +6,7 @@ import { LINES } from "./colours.js";
 import { comparison } from "./comparison.js";
 import { element, section, table } from "./dom.js";
 import { decimals, percent, range, tick, whole } from "./format.js";
+import { parity } from "./parity.js";
 import { plot } from "./plot.js";
 
 export const TITLE = "Errors";
@@ -40,6 +41,7 @@ function shown(errors) {
     section(`Protocol ${errors.protocol}${errors.version == null ? "" : `, version ${errors.version} of the potential`}`, correlations(errors),
       energies(errors.energy), byVersion(errors),
       element("div", { class: "plots" }, figure("γ", all.gamma), figure("γ_nbr", all.gamma_nbr))),
+    parity(errors.parity),
     comparison(errors),
     section("By γ", quantiles("γ", all.gamma, errors.large)), section("By γ_nbr", quantiles("γ_nbr", all.gamma_nbr, errors.large)),
     section("Bounds of the force error", ...errorBounds(errors.calibration)),

@@ -18,6 +18,7 @@ export function whole(value, unit = "") {
 /** With three significant digits. */
 export function digits(value, unit = "") {
   if (value == null || !Number.isFinite(value)) return NONE;
+  if (value === 0) return decimals(0, 0, unit);
   const size = Math.abs(value);
   if (size !== 0 && (size < 1e-3 || size >= 1e6)) return value.toExponential(2).replace("-", "−") + (unit && `\u202f${unit}`);
   return decimals(value, size >= 100 ? 0 : size >= 10 ? 1 : size >= 1 ? 2 : 3, unit);

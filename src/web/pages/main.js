@@ -6,13 +6,14 @@ import * as candidate from "./candidate.js";
 import * as candidates from "./candidates.js";
 import * as errors from "./errors.js";
 import * as hosts from "./hosts.js";
+import * as map from "./map.js";
 import * as mixture from "./mixture.js";
 import * as overview from "./overview.js";
 import * as walk from "./walk.js";
 import { campaignState } from "./campaign_state.js";
 
 /** Pages in the order of the menu, by the first word of their address. */
-const PAGES = { overview, candidates, mixture, errors, hosts };
+const PAGES = { overview, candidates, map, mixture, errors, hosts };
 /** Pages of one thing, and the page of the menu that they belong to. */
 const DETAILS = { candidate: { page: candidate, below: candidates }, walk: { page: walk, below: overview } };
 const CONNECTIONS = { live: "● live", finished: "✓ finished", stopped: "○ stopped: no run is active", lost: "○ no connection: retrying", unreachable: "○ the database does not answer" };

@@ -70,7 +70,7 @@ function summary(status) {
       underWay > 0 || hasEarlyEnds(status.ends) ? ended(status.ends, walks.length - underWay) : "",
       status.steps_per_second == null ? "" : `${digits(status.steps_per_second)} steps/s in all`),
     tile("Candidates", `${whole(candidates.accepted)} accepted`,
-      `of ${whole(candidates.seen)} seen (${percent(share(candidates.accepted, candidates.seen))})`,
+      candidates.seen === 0 ? "none seen yet" : `of ${whole(candidates.seen)} seen (${percent(share(candidates.accepted, candidates.seen))})`,
       declined && `declined: ${declined}`, candidates.control > 0 && counted(candidates.control, "control frame"),
       candidates.left_out > 0 && `${whole(candidates.left_out)} left out (could not be graded, or control frames with atoms too close)`,
       status.shared_structures > 0 && `${whole(status.shared_structures)} of them identical to structures of their biased walks`),

@@ -3,7 +3,9 @@
 import { drawing, element } from "./dom.js";
 import { digits, tick } from "./format.js";
 
-const [WIDTH, HEIGHT, LEFT, BOTTOM, TOP, RIGHT] = [440, 230, 54, 40, 10, 12];
+const [LEFT, BOTTOM, TOP, RIGHT] = [54, 40, 10, 12];
+/** Width and height of a plot. */
+const SIZE = [440, 230];
 
 const SHAPES = {
   circle: "M-3 0a3 3 0 1 0 6 0a3 3 0 1 0 -6 0", square: "M-2.6 -2.6h5.2v5.2h-5.2z", diamond: "M0 -3.6L3.6 0L0 3.6L-3.6 0z",
@@ -13,19 +15,20 @@ const SHAPES = {
 const HOLLOW = new Set(["cross", "plus", "ring"]);
 
 /**
- * A plot: `title`, `x` and `y` (axes: title; `ticks` formats a number; `steps`: distances of ticks; `min_atoms`, `most`: values to include; `logarithmic`), and
+ * A plot: `title`, `size` (width and height), `role` of the drawing (`group` if its marks are links to walk through), `x` and `y` (axes: title; `ticks` formats a number; `steps`: distances of ticks; `min_atoms`, `most`: values to include; `logarithmic`), and
  * `lines` ({name, colour, dash, points: [[x, y], …]}), `bands` ({colour, points: [[x, low, high], …]}) and `marks` ({name, colour, shape,
- * points: [[x, y, href, text], …]}). A y of null breaks a line.
+ * points: [[x, y, href, text, colour], …]}; the colour of a point replaces that of its kind). A y of null breaks a line.
  */
-export function plot({ title, x, y, lines = [], bands = [], marks = [] }) {
+export function plot({ title, size = SIZE, role = "img", x, y, lines = [], bands = [], marks = [] }) {
   const points = [...lines, ...marks].flatMap((one) => one.points).filter(([, value]) => value != null);
   const edges = bands.flatMap((band) => band.points.flatMap(([at, low, high]) => [[at, low], [at, high]]));
   const all = [...points, ...edges].filter(([a, b]) => Number.isFinite(a) && Number.isFinite(b));
   if (all.length === 0) return figure(title, [], element("p", { class: "quiet empty" }, "no data yet"));
-  const across = axis(x, all.map(([value]) => value), LEFT, WIDTH - RIGHT);
-  const up = axis(y, all.map(([, value]) => value), HEIGHT - BOTTOM, TOP);
-  const svg = drawing("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": described(title, x, y, lines, marks, all) },
-    grid(across, up), titles(x, y),
+  const [width, height] = size;
+  const across = axis(x, all.map(([value]) => value), LEFT, width - RIGHT);
+  const up = axis(y, all.map(([, value]) => value), height - BOTTOM, TOP);
+  const svg = drawing("svg", { viewBox: `0 0 ${width} ${height}`, role, "aria-label": described(title, x, y, lines, marks, all) },
+    grid(across, up, size), titles(x, y, size),
     bands.map((band) => drawing("path", { d: area(band.points, across, up), fill: band.colour, "fill-opacity": 0.2 })),
     lines.map((line) => drawing("path", { d: path(line.points, across, up), fill: "none", stroke: line.colour, "stroke-width": 1.7,
       "stroke-dasharray": line.dash ?? "", "stroke-linejoin": "round", "stroke-linecap": "round" })),
@@ -49,7 +52,7 @@ function paint(colour, shape) {
   return HOLLOW.has(shape) ? { fill: "none", stroke: colour, "stroke-width": 1.5 } : { fill: colour, "fill-opacity": 0.75 };
 }
 
-function mark({ colour, shape }, [x, y, href, text], across, up) {
+function mark({ colour: ofKind, shape }, [x, y, href, text, colour = ofKind], across, up) {
   const drawn = drawing("path", { d: SHAPES[shape], transform: `translate(${across.at(x).toFixed(1)} ${up.at(y).toFixed(1)})`,
     ...paint(colour, shape) }, text && drawing("title", {}, text));
   return href ? drawing("a", { href, tabindex: "-1" }, drawn) : drawn;
@@ -93,20 +96,20 @@ function roundPowers(low, high) {
   return powers.flatMap((power) => factors.map((factor) => factor * 10 ** power)).filter(inside);
 }
 
-function grid(across, up) {
+function grid(across, up, [width, height]) {
   return drawing("g", { class: "grid" },
     across.ticks.map((value) => [
-      drawing("path", { d: `M${across.at(value)} ${TOP}V${HEIGHT - BOTTOM}` }),
-      drawing("text", { x: across.at(value), y: HEIGHT - BOTTOM + 14, "text-anchor": "middle" }, across.text(value))]).flat(),
+      drawing("path", { d: `M${across.at(value)} ${TOP}V${height - BOTTOM}` }),
+      drawing("text", { x: across.at(value), y: height - BOTTOM + 14, "text-anchor": "middle" }, across.text(value))]).flat(),
     up.ticks.map((value) => [
-      drawing("path", { d: `M${LEFT} ${up.at(value)}H${WIDTH - RIGHT}` }),
+      drawing("path", { d: `M${LEFT} ${up.at(value)}H${width - RIGHT}` }),
       drawing("text", { x: LEFT - 6, y: up.at(value) + 3.5, "text-anchor": "end" }, up.text(value))]).flat());
 }
 
-function titles(x, y) {
-  const middle = (TOP + HEIGHT - BOTTOM) / 2;
+function titles(x, y, [width, height]) {
+  const middle = (TOP + height - BOTTOM) / 2;
   return drawing("g", { class: "titles" },
-    drawing("text", { x: (LEFT + WIDTH - RIGHT) / 2, y: HEIGHT - 6, "text-anchor": "middle" }, x.title),
+    drawing("text", { x: (LEFT + width - RIGHT) / 2, y: height - 6, "text-anchor": "middle" }, x.title),
     drawing("text", { x: 11, y: middle, "text-anchor": "middle", transform: `rotate(-90 11 ${middle})` }, y.title));
 }
 

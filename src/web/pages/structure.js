@@ -1,48 +1,104 @@
-// A 3D view of the atoms, coloured by γ. Rotate with the mouse or arrow keys; select an atom with the mouse, with , and . or in the table.
+// A 3D view of the atoms, coloured by γ, force error or element. Rotate with the mouse or arrow keys; select an atom with the mouse, with , and . or in the
+// table; m measures distances from the selected atom.
 
 import { css, scale } from "./colours.js";
 import { element } from "./dom.js";
+import { elementColours } from "./elements.js";
 import { decimals } from "./format.js";
+import { hasCell, inCell, shortest } from "./geometry.js";
+import { colourBar, colourNames } from "./legend.js";
+import { fitting, paint, sceneOf } from "./painting.js";
 
-/** Drawn radii, Å: slightly below the covalent radii. */
-const RADII = { H: 0.35, C: 0.6, N: 0.58, O: 0.55, F: 0.53, Al: 0.95, Si: 0.9, P: 0.88, S: 0.85, Cl: 0.82 };
-const RADIUS = 1.05;
 const TURN = Math.PI / 24;
+/** The side from which structures are first seen. */
+export const SIDE = [[0.9211, -0.3894, 0], [0.0963, 0.2279, 0.9689], [-0.3773, -0.8924, 0.2474]];
+/** Largest number of atoms drawn. */
+const MAX_ATOMS = 6000;
 
 /** Quantities to colour atoms by. */
 const BY = { gamma_original: "γ₀, original mixture", gamma_walker: "γ, the walker's mixture", gamma_nbr_original: "γ₀_nbr, original mixture", error: "force error (eV/Å)" };
+const ELEMENT = "element";
+
+/** A structure with its atoms inside the cell. */
+export function wrapped(found) {
+  return { ...found, positions: found.positions.map((at) => inCell(at, found)) };
+}
 
 /** The view with its table. `grades` may be missing. */
 export function view(found, grades, labels) {
-  const structure = { ...found, positions: found.positions.map((at) => inCell(at, found)) };
+  const structure = wrapped(found);
   const errors = labels.find((label) => label.status === "label")?.model?.atoms;
   const atoms = structure.species.map((species, k) => ({ ...grades?.[k], atom: k, species, error: errors?.[k], at: structure.positions[k] }));
   const choices = Object.keys(BY).filter((key) => atoms.some((atom) => atom[key] != null));
-  const state = { turned: [[1, 0, 0], [0, 0.2, 0.98], [0, -0.98, 0.2]], zoom: 1, picked: null, by: choices[0] };
+  const state = { turned: SIDE.map((row) => [...row]), zoom: 1, fit: null, picked: null, anchor: null, measured: null, by: choices[0] ?? ELEMENT, bonds: atoms.length <= 400,
+    axes: true, times: [1, 1, 1] };
+  let [scene, drawn] = [sceneOf(structure), []];
+  const colours = elementColours(structure.species);
   const canvas = element("canvas", { tabindex: "0", role: "application", "aria-describedby": "picked",
-    "aria-label": `${atoms.length} atoms. Arrow keys rotate, + and − zoom, comma and full stop select an atom; the table has the same numbers.` });
+    "aria-label": `${atoms.length} atoms. Arrow keys rotate, + and − zoom, comma and full stop select an atom, m measures from it; the table has the same numbers.` });
   const selection = element("p", { id: "picked", role: "status" }, "No atom is selected.");
-  const legend = element("div", { class: "legend" });
+  const legend = element("div");
   const rows = new Map();
-  const draw = () => paint(canvas, structure, atoms, state);
+  const draw = () => {
+    const { clientWidth: width, clientHeight: height } = canvas;
+    if (width === 0) return;
+    const now = fitting(scene, state.turned, width, height);
+    state.fit ??= now;
+    // Turning changes the scale only where a part would be cut off.
+    state.scale = state.zoom * Math.min(state.fit, now);
+    const most = largest(atoms, state);
+    drawn = paint(canvas, scene, state, (atom) => (state.by === ELEMENT ? colours[structure.species[atom]] : scale((atoms[atom][state.by] ?? 0) / most)));
+  };
   const pick = (k) => {
     rows.get(state.picked)?.removeAttribute("aria-selected");
     state.picked = k;
     rows.get(k)?.setAttribute("aria-selected", "true");
-    selection.textContent = k == null ? "No atom is selected." : describe(atoms[k]);
+    const apart = k != null && state.anchor != null && k !== state.anchor;
+    state.measured = apart ? shortest(atoms[state.anchor].at, atoms[k].at, structure) : null;
+    selection.textContent = k == null ? "No atom is selected." : [describe(atoms[k]), measured(state)].filter(Boolean).join("; ");
     draw();
   };
-  const chooser = choices.length > 0 && element("label", {}, "colour by ", element("select", { onchange: (event) => {
-    state.by = event.target.value;
-    legend.replaceChildren(...scaleOf(atoms, state));
+  const anchor = () => {
+    state.anchor = state.picked === state.anchor ? null : state.picked;
+    pick(state.picked);
+  };
+  const explain = () => legend.replaceChildren(state.by === ELEMENT ? colourNames("", Object.entries(colours).map(([name, colour]) => [name, css(colour)]))
+    : colourBar(BY[state.by], "0", decimals(largest(atoms, state), 2)));
+  const again = () => {
+    scene = sceneOf(structure, state.times);
+    state.fit = null;
     draw();
-  } }, choices.map((key) => element("option", { value: key }, BY[key]))));
-  legend.replaceChildren(...scaleOf(atoms, state));
-  listen(canvas, atoms, state, draw, pick);
-  new ResizeObserver(draw).observe(canvas);
+  };
+  explain();
+  listen(canvas, atoms, state, { draw, pick, anchor, drawn: () => drawn });
+  new ResizeObserver(() => {
+    state.fit = null;
+    draw();
+  }).observe(canvas);
   return element("div", { class: "structure" },
-    element("div", {}, canvas, element("div", { class: "below" }, chooser, legend), selection),
+    element("div", {}, canvas, controls({ state, choices, structure, explain, again, draw, anchor }), legend, selection),
     tableOf(atoms, choices, rows, pick));
+}
+
+function controls({ state, choices, structure, explain, again, draw, anchor }) {
+  const by = element("label", {}, "colour by ", element("select", { onchange: (event) => {
+    state.by = event.target.value;
+    explain();
+    draw();
+  } }, [...choices, ELEMENT].map((key) => element("option", { value: key }, BY[key] ?? "element"))));
+  const tick = (key, name) => element("label", {}, element("input", { type: "checkbox", checked: state[key], onchange: (event) => {
+    state[key] = event.target.checked;
+    draw();
+  } }), ` ${name}`);
+  // Repeats along periodic directions, as long as there are not too many atoms.
+  const most = (n) => n ** structure.periodic.filter(Boolean).length * structure.positions.length;
+  const numbers = hasCell(structure) && structure.periodic.some(Boolean) ? [1, 2, 3].filter((n) => n === 1 || most(n) <= MAX_ATOMS) : [1];
+  const repeat = numbers.length > 1 && element("label", {}, "cells ", element("select", { onchange: (event) => {
+    state.times = structure.periodic.map((is) => (is ? Number(event.target.value) : 1));
+    again();
+  } }, numbers.map((n) => element("option", { value: n }, structure.periodic.map((is) => (is ? n : 1)).join(" × ")))));
+  const measure = element("button", { type: "button", class: "small", onclick: anchor }, "measure from the selected atom");
+  return element("div", { class: "below" }, by, tick("bonds", "bonds"), hasCell(structure) && tick("axes", "axes"), repeat, measure);
 }
 
 function describe(atom) {
@@ -51,19 +107,13 @@ function describe(atom) {
   return [`Atom ${atom.atom}: ${atom.species} at (${place}) Å`, ...numbers, atom.triggered ? "above the collection threshold" : ""].filter(Boolean).join("; ");
 }
 
-function largest(atoms, { by }) {
-  return atoms.reduce((most, atom) => Math.max(most, atom[by] ?? 0), by === "error" ? 0.1 : 1);
+function measured({ anchor, measured: vector }) {
+  if (anchor == null) return "";
+  return vector == null ? "distances are measured from it: select another atom" : `${decimals(Math.hypot(...vector), 3, "Å")} from atom ${anchor}, to the nearest image`;
 }
 
-function scaleOf(atoms, state) {
-  if (!state.by) return [];
-  const most = largest(atoms, state);
-  const steps = Array.from({ length: 24 }, (_, k) => {
-    const step = element("i");
-    step.style.background = css(scale(k / 23));
-    return step;
-  });
-  return [element("span", {}, "0"), element("span", { class: "bar", "aria-hidden": "true" }, steps), element("span", {}, decimals(most, 2))];
+function largest(atoms, { by }) {
+  return atoms.reduce((most, atom) => Math.max(most, atom[by] ?? 0), by === "error" ? 0.1 : 1);
 }
 
 function tableOf(atoms, choices, rows, pick) {
@@ -83,7 +133,7 @@ function tableOf(atoms, choices, rows, pick) {
     element("tbody", {}, lines)));
 }
 
-function listen(canvas, atoms, state, draw, pick) {
+function listen(canvas, atoms, state, { draw, pick, anchor, drawn }) {
   let held = null;
   canvas.addEventListener("pointerdown", (event) => {
     held = { x: event.clientX, y: event.clientY, moved: 0 };
@@ -97,7 +147,7 @@ function listen(canvas, atoms, state, draw, pick) {
     draw();
   });
   canvas.addEventListener("pointerup", (event) => {
-    if (held && held.moved < 4) pick(hit(canvas, atoms, event));
+    if (held && held.moved < 4) pick(hit(canvas, drawn(), event));
     held = null;
   });
   canvas.addEventListener("wheel", (event) => {
@@ -109,7 +159,7 @@ function listen(canvas, atoms, state, draw, pick) {
   const keys = {
     ArrowLeft: () => turn(state, 0, -TURN), ArrowRight: () => turn(state, 0, TURN), ArrowUp: () => turn(state, -TURN, 0),
     ArrowDown: () => turn(state, TURN, 0), "+": () => zoom(state, 1.15), "=": () => zoom(state, 1.15), "-": () => zoom(state, 1 / 1.15),
-    ".": () => next(1), ",": () => next(-1), Escape: () => pick(null),
+    ".": () => next(1), ",": () => next(-1), m: anchor, Escape: () => pick(null),
   };
   canvas.addEventListener("keydown", (event) => {
     const act = keys[event.key];
@@ -133,107 +183,10 @@ function turn(state, down, right) {
   state.turned = [x1, row(y, k, z1, -l), row(z1, k, y, l)];
 }
 
-function paint(canvas, structure, atoms, state) {
-  const ratio = devicePixelRatio || 1;
-  const { clientWidth: width, clientHeight: height } = canvas;
-  if (width === 0) return;
-  [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
-  const context = canvas.getContext("2d");
-  context.scale(ratio, ratio);
-  const ink = getComputedStyle(canvas).color;
-  const corners = cornersOf(structure);
-  const centre = middle([...corners, ...structure.positions]);
-  const reach = Math.max(...[...corners, ...structure.positions].map((point) => Math.hypot(...point.map((x, k) => x - centre[k]))), 2) + RADIUS;
-  // Perspective enlarges the view by 1.4 % at most: 1 / √(1 − 1/36).
-  const size = (0.97 * state.zoom * Math.min(width, height)) / 2 / reach;
-  const place = (point) => {
-    const from = point.map((x, k) => x - centre[k]);
-    const [x, y, z] = state.turned.map((row) => row[0] * from[0] + row[1] * from[1] + row[2] * from[2]);
-    // A slight perspective shows depth.
-    const near = 1 / (1 - z / (6 * reach));
-    return { x: width / 2 + x * size * near, y: height / 2 - y * size * near, z, near };
-  };
-  edges(corners).forEach((edge) => wire(context, edge.map(place), ink));
-  const most = largest(atoms, state);
-  const balls = atoms.map((atom) => Object.assign(atom, { drawn: place(atom.at) })).sort((a, b) => a.drawn.z - b.drawn.z);
-  for (const atom of balls) ball(context, atom, size, state, most, reach, ink);
-}
-
-function ball(context, atom, size, state, most, reach, ink) {
-  const { x, y, z, near } = atom.drawn;
-  const radius = Math.max((RADII[atom.species] ?? RADIUS) * size * near, 2);
-  atom.drawn.radius = radius;
-  const colour = state.by ? scale((atom[state.by] ?? 0) / most) : [150, 160, 175];
-  const depth = 0.12 * (z / reach - 1);
-  const shade = context.createRadialGradient(x - radius / 3, y - radius / 3, radius / 8, x, y, radius);
-  shade.addColorStop(0, css(colour, 0.55));
-  shade.addColorStop(0.35, css(colour, depth));
-  shade.addColorStop(1, css(colour, -0.35));
-  context.beginPath();
-  context.arc(x, y, radius, 0, 2 * Math.PI);
-  context.fillStyle = shade;
-  context.fill();
-  context.lineWidth = 0.75;
-  context.strokeStyle = css(colour, -0.55);
-  context.stroke();
-  if (atom.atom !== state.picked) return;
-  context.beginPath();
-  context.arc(x, y, radius + 3, 0, 2 * Math.PI);
-  context.lineWidth = 2.5;
-  context.strokeStyle = ink;
-  context.stroke();
-}
-
 /** The frontmost atom at a position on the screen. */
-function hit(canvas, atoms, event) {
+function hit(canvas, drawn, event) {
   const box = canvas.getBoundingClientRect();
   const [x, y] = [event.clientX - box.left, event.clientY - box.top];
-  const under = atoms.filter(({ drawn }) => drawn && Math.hypot(drawn.x - x, drawn.y - y) <= drawn.radius);
-  return under.reduce((front, atom) => (front == null || atom.drawn.z > front.drawn.z ? atom : front), null)?.atom ?? null;
-}
-
-function wire(context, [from, to], ink) {
-  context.beginPath();
-  context.moveTo(from.x, from.y);
-  context.lineTo(to.x, to.y);
-  context.globalAlpha = 0.45;
-  context.lineWidth = 1;
-  context.strokeStyle = ink;
-  context.stroke();
-  context.globalAlpha = 1;
-}
-
-/** The periodic image of an atom inside the cell. */
-function inCell(at, { cell: [a, b, c], periodic }) {
-  const volume = dot(a, cross(b, c));
-  if (volume === 0) return at;
-  const shares = [cross(b, c), cross(c, a), cross(a, b)].map((normal) => dot(at, normal) / volume);
-  const whole = shares.map((share, k) => (periodic[k] ? Math.floor(share + 1e-9) : 0));
-  return at.map((x, axis) => x - whole[0] * a[axis] - whole[1] * b[axis] - whole[2] * c[axis]);
-}
-
-function dot(a, b) {
-  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-}
-
-function cross(a, b) {
-  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-}
-
-/** The eight corners of the cell. Empty without a cell. */
-function cornersOf({ cell }) {
-  if (cell.flat().every((x) => x === 0)) return [];
-  return Array.from({ length: 8 }, (_, corner) => [0, 1, 2].map((axis) => cell.reduce((sum, vector, k) => sum + ((corner >> k) & 1) * vector[axis], 0)));
-}
-
-/** Pairs of corners that differ in one lattice vector. */
-function edges(corners) {
-  return corners.flatMap((corner, k) => [1, 2, 4].filter((bit) => !(k & bit)).map((bit) => [corner, corners[k | bit]]));
-}
-
-function middle(points) {
-  return [0, 1, 2].map((axis) => {
-    const values = points.map((point) => point[axis]);
-    return (Math.min(...values) + Math.max(...values)) / 2;
-  });
+  const under = drawn.filter((ball) => Math.hypot(ball.x - x, ball.y - y) <= ball.radius);
+  return under.reduce((front, ball) => (front == null || ball.z > front.z ? ball : front), null)?.atom ?? null;
 }

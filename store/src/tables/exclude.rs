@@ -88,6 +88,24 @@ impl Store {
         self.change_status(ids, None, now).await
     }
 
+    /// What [`Self::exclude`] would change with this reason, or [`Self::include`] without one. Changes nothing.
+    ///
+    /// # Errors
+    /// As for those.
+    pub async fn exclusion_changes(
+        &self,
+        ids: &[String],
+        reason: Option<&str>,
+    ) -> Result<Vec<ExclusionChange>> {
+        let named = self.named_structures(ids).await?;
+        let mut transaction = self.database.begin_read().await?;
+        let mut changes = Vec::new();
+        for named in named {
+            changes.push(planned(&mut transaction, &named, reason).await?);
+        }
+        Ok(changes)
+    }
+
     /// Every excluded label, in order of exclusion.
     pub async fn excluded(&self) -> Result<Vec<ExcludedLabel>> {
         let mut transaction = self.database.begin_read().await?;
@@ -152,36 +170,48 @@ impl Store {
     }
 }
 
-/// Excludes the labels of a structure, or includes them without a `reason`.
-async fn change(
+/// What excluding the labels of a structure changes, or including them without a `reason`.
+async fn planned(
     transaction: &mut Transaction,
-    NamedStructure { structure, id }: NamedStructure,
+    NamedStructure { structure, id }: &NamedStructure,
     reason: Option<&str>,
-    now: i64,
 ) -> Result<ExclusionChange> {
     let labels: Vec<LabelStatusRow> =
-        query(LABEL_STATUS).bind(structure).fetch_all(&mut *transaction).await?;
-    let job = newest_job(transaction, structure).await?;
+        query(LABEL_STATUS).bind(*structure).fetch_all(&mut *transaction).await?;
     if labels.is_empty() {
-        return Err(no_label(id, job));
+        return Err(no_label(id.clone(), newest_job(transaction, *structure).await?));
     }
-    let changed = match reason {
-        Some(reason) => query(EXCLUDE).bind(structure).bind(now).bind(reason),
-        None => query(INCLUDE).bind(structure),
-    };
-    let changed = changed.execute(&mut *transaction).await? > 0;
+    let changing = if reason.is_some() { "label" } else { "excluded" };
+    let changed = labels.iter().any(|label| label.status == changing);
     let mut protocols: Vec<_> = labels.iter().map(|label| label.protocol.clone()).collect();
     protocols.dedup();
-    if changed {
-        let kind = if reason.is_some() { "exclude" } else { "include" };
-        let job = job.map(|(number, _)| number);
-        let detail = json!({ "candidate": id, "job": job, "reason": reason, "protocols": protocols });
-        insert_operation(transaction, now, kind, &detail).await?;
-    }
     let before =
         labels.into_iter().find(|label| label.status == "excluded").and_then(|label| label.exclusion);
     let excluded = reason.map(|reason| before.filter(|_| !changed).unwrap_or(reason.to_owned()));
-    Ok(ExclusionChange { id, protocols, changed, excluded })
+    Ok(ExclusionChange { id: id.clone(), protocols, changed, excluded })
+}
+
+/// Excludes the labels of a structure, or includes them without a `reason`.
+async fn change(
+    transaction: &mut Transaction,
+    named: NamedStructure,
+    reason: Option<&str>,
+    now: i64,
+) -> Result<ExclusionChange> {
+    let change = planned(transaction, &named, reason).await?;
+    if change.changed {
+        let update = match reason {
+            Some(reason) => query(EXCLUDE).bind(named.structure).bind(now).bind(reason),
+            None => query(INCLUDE).bind(named.structure),
+        };
+        update.execute(&mut *transaction).await?;
+        let job = newest_job(transaction, named.structure).await?.map(|(number, _)| number);
+        let kind = if reason.is_some() { "exclude" } else { "include" };
+        let detail =
+            json!({ "candidate": change.id, "job": job, "reason": reason, "protocols": change.protocols });
+        insert_operation(transaction, now, kind, &detail).await?;
+    }
+    Ok(change)
 }
 
 async fn newest_job(transaction: &mut Transaction, structure: i64) -> Result<Option<(i64, String)>> {

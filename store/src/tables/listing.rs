@@ -41,6 +41,7 @@ impl FromRow for ListedCandidate {
             attempts: row.get("attempts")?,
             value: row.get("job_value")?,
             value_factors: decode_factors(row.get::<Option<String>>("value_factors")?.as_deref())?,
+            potential_energy: row.get("candidate__energy")?,
             energy: label.as_ref().map(|label| label.energy),
             max_force: label.as_ref().map(Label::max_force),
             retry_adjustments: label.map(|label| label.details.retry_adjustments),

@@ -142,6 +142,30 @@ impl Store {
         Ok(changes)
     }
 
+    /// What [`Self::take_lower_states`] would change. Changes nothing.
+    ///
+    /// # Errors
+    /// As for that.
+    pub async fn lower_state_changes(&self, ids: Option<&[String]>) -> Result<Vec<LowerStateChange>> {
+        let named = match ids {
+            Some(ids) => self.named_structures(ids).await?,
+            None => self.with_lower_states().await?,
+        };
+        let mut transaction = self.database.begin_read().await?;
+        let mut changes = Vec::new();
+        for NamedStructure { structure, id } in named {
+            if ids.is_some() {
+                exclude::check_has_label(&mut transaction, structure, &id).await?;
+            }
+            let mut taken = Vec::new();
+            for pair in pairs(&mut transaction, Some(structure)).await? {
+                taken.push(describe(&mut transaction, &pair).await?.0);
+            }
+            changes.push(LowerStateChange { id, taken });
+        }
+        Ok(changes)
+    }
+
     async fn with_lower_states(&self) -> Result<Vec<NamedStructure>> {
         let mut transaction = self.database.begin_read().await?;
         let mut numbers: Vec<_> =

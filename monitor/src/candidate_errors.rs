@@ -1,0 +1,76 @@
+//! Errors of the potential for single labelled candidates.
+
+use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
+
+use atoms::cell::{norm, sub};
+use serde::Serialize;
+use store::{ExportCursor, ExportFilter, ExportRow, ExportSource, Store, StoreError};
+use wire::ContentHash;
+
+use crate::energy_errors::ProtocolEnergyOffsets;
+use crate::label_statistics::frames::{mean, stress_error};
+
+/// Errors of a candidate against its label under the protocol in force; `None` where they are not known.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct CandidateErrors {
+    /// E_model − E_label per atom without the offsets of the elements, eV.
+    pub energy: Option<f64>,
+    /// Mean absolute error of the force components, eV/Å.
+    pub force_mae: Option<f64>,
+    /// Largest |F_model − F_label| of an atom, eV/Å.
+    pub max_force_error: Option<f64>,
+    /// Root mean square error of the six components of the stress, eV/Å³.
+    pub stress: Option<f64>,
+}
+
+/// Reads errors one by one, and keeps what all have in common.
+#[derive(Debug)]
+pub struct ErrorReader {
+    /// `None` without a label protocol.
+    protocol: Option<ContentHash>,
+    /// Offsets of the elements, by version of the potential.
+    offsets: BTreeMap<u32, ProtocolEnergyOffsets>,
+}
+
+impl ErrorReader {
+    /// For the labels of the protocol in force.
+    pub async fn new(store: &Store) -> Result<Self, StoreError> {
+        let protocol = store.protocol_in_force().await?.map(|protocol| protocol.hash);
+        Ok(Self { protocol, offsets: BTreeMap::new() })
+    }
+
+    /// The errors of the candidate of a decision, whose walk has `version` of the potential; `None` without a label.
+    pub async fn read(
+        &mut self,
+        store: &Store,
+        decision: i64,
+        version: u32,
+    ) -> Result<Option<CandidateErrors>, StoreError> {
+        let Some(protocol) = self.protocol else { return Ok(None) };
+        let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
+        let before = Some(ExportCursor::Candidate(decision - 1));
+        let found = store.labelled(&filter, before, 1).await?.pop();
+        let Some(row) = found.filter(|row| row.cursor == ExportCursor::Candidate(decision)) else {
+            return Ok(None);
+        };
+        let offsets = match self.offsets.entry(version) {
+            Entry::Occupied(known) => known.into_mut(),
+            Entry::Vacant(place) => place.insert(ProtocolEnergyOffsets::fit(store, protocol, version).await?),
+        };
+        Ok(errors(&row, offsets))
+    }
+}
+
+fn errors(row: &ExportRow, offsets: &ProtocolEnergyOffsets) -> Option<CandidateErrors> {
+    let ExportSource::Candidate { block, .. } = &row.source else { return None };
+    let view = block.view();
+    let differences: Vec<_> =
+        view.forces.iter().zip(&row.label.forces).map(|(model, label)| sub(*model, *label)).collect();
+    Some(CandidateErrors {
+        energy: offsets.error_per_atom(&row.structure, view.energy(), row.label.energy),
+        force_mae: mean(differences.iter().flatten().map(|component| component.abs())),
+        max_force_error: differences.iter().map(|difference| norm(*difference)).reduce(f64::max),
+        stress: row.label.stress.and_then(|label| stress_error(&row.structure, view.virial(), label)),
+    })
+}

@@ -1,0 +1,103 @@
+//! The structures that a filter of the table shows, as one file.
+
+use std::collections::BTreeMap;
+use std::error::Error;
+use std::sync::Arc;
+
+use atoms::extxyz::{LabelKeys, write_frame};
+use axum::body::Body;
+use axum::extract::{RawQuery, State};
+use axum::http::{StatusCode, header};
+use axum::response::IntoResponse;
+use futures_util::stream::{self, StreamExt};
+use store::{ExportCursor, ExportFilter, ListedCandidate, Store};
+use wire::{ContentHash, WalkConditions, WalkId};
+
+use super::query::{CandidateQuery, TableOrder};
+use crate::export_frame;
+use crate::web::dashboard::Dashboard;
+use crate::web::dashboard::candidate::frame_of;
+use crate::web::dashboard::response::{ApiError, ApiResult};
+
+/// Largest number of structures in a file, and of candidates searched for them.
+const MAX_STRUCTURES: usize = 2000;
+const MAX_SEARCHED: usize = 100_000;
+
+/// What all frames need.
+struct FrameWriter {
+    store: Store,
+    campaign: String,
+    protocol: Option<ContentHash>,
+    conditions: BTreeMap<WalkId, WalkConditions>,
+}
+
+/// `GET /api/candidates.extxyz?fate=…&state=…&where=…`: in the order of the decisions or another order with an index. Labelled
+/// structures are as in `calmwalk export --control`; the others have no energy, forces and stress.
+pub async fn extxyz(State(dashboard): State<Dashboard>, RawQuery(query): RawQuery) -> ApiResult {
+    let mut query = CandidateQuery::parse(query.as_deref().unwrap_or_default())?;
+    if query.after.is_some() || query.limit.is_some() {
+        return Err(ApiError::bad_request(
+            "a file has all structures that match: 'after' and 'limit' do not apply",
+        ));
+    }
+    if matches!(query.order, TableOrder::Column(_)) {
+        (query.order, query.ascending) = (TableOrder::Decision, false);
+    }
+    let store = dashboard.store;
+    let found = query.collect(&store, None, MAX_STRUCTURES + 1, MAX_SEARCHED).await?;
+    if found.rows.len() > MAX_STRUCTURES || found.next.is_some() {
+        let why = match found.rows.len() > MAX_STRUCTURES {
+            true => format!("more than {MAX_STRUCTURES} structures match"),
+            false => format!("only {MAX_SEARCHED} candidates are searched for a file"),
+        };
+        let what = "narrow the selection, or use calmwalk export --where on the host of the campaign";
+        return Err(ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, format!("{why}: {what}")));
+    }
+    if found.rows.is_empty() {
+        return Err(ApiError::new(StatusCode::NOT_FOUND, "no candidate matches"));
+    }
+    let writer = Arc::new(FrameWriter {
+        campaign: store.campaign().await?.id.to_string(),
+        protocol: store.protocol_in_force().await?.map(|protocol| protocol.hash),
+        conditions: store.walk_conditions().await?,
+        store,
+    });
+    // The first frame before the headers, so that a damaged store is an error and no short file.
+    let mut rows = found.rows.into_iter();
+    let first = match rows.next() {
+        Some(row) => writer.frame(&row).await?,
+        None => Vec::new(),
+    };
+    let rest = stream::iter(rows).then(move |row| {
+        let writer = Arc::clone(&writer);
+        async move { writer.frame(&row).await.map_err(Box::<dyn Error + Send + Sync>::from) }
+    });
+    let body = Body::from_stream(stream::iter([Ok(first)]).chain(rest));
+    let disposition = "attachment; filename=\"candidates.extxyz\"";
+    let headers =
+        [(header::CONTENT_TYPE, "text/plain; charset=utf-8"), (header::CONTENT_DISPOSITION, disposition)];
+    Ok((headers, body).into_response())
+}
+
+impl FrameWriter {
+    /// The text of a structure.
+    async fn frame(&self, row: &ListedCandidate) -> Result<Vec<u8>, ApiError> {
+        let labelled = match (self.protocol, row.energy) {
+            (Some(protocol), Some(_)) => {
+                let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
+                let before = Some(ExportCursor::Candidate(row.decision - 1));
+                let found = self.store.labelled(&filter, before, 1).await?.pop();
+                found.filter(|found| found.cursor == ExportCursor::Candidate(row.decision))
+            }
+            _ => None,
+        };
+        let frame = match labelled {
+            Some(labelled) => export_frame::frame(labelled, LabelKeys::Ase, &self.campaign, &self.conditions),
+            None => frame_of(&self.store, &row.id).await?,
+        };
+        let mut bytes = Vec::new();
+        write_frame(&mut bytes, &frame)
+            .map_err(|error| ApiError::new(StatusCode::UNPROCESSABLE_ENTITY, error))?;
+        Ok(bytes)
+    }
+}
