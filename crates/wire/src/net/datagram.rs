@@ -150,6 +150,20 @@ pub fn leave(session: u64, agent: &AgentInfo) -> Vec<u8> {
     message(&AgentRequest::Leave { session, id: agent.id.clone() })
 }
 
+/// The request for the mixture that an agent has joined with.
+pub fn first_mixture(session: u64, version: u64) -> Vec<u8> {
+    message(&MixtureFetch::new(session, None, version).request())
+}
+
+/// Reads the reply to it, which must contain the whole mixture.
+///
+/// # Errors
+/// The agent must join again, or the reply is damaged or too short.
+pub fn read_first_mixture(reply: &[u8]) -> Result<Mixture, LinkError> {
+    let mixture = MixtureFetch::new(0, None, 0).receive(reply)?;
+    mixture.ok_or_else(|| LinkError::InvalidReply("a part of the mixture is missing".to_owned()))
+}
+
 fn message(request: &AgentRequest<'_>) -> Vec<u8> {
     frame::with_block(&encode(request), None).as_bytes().to_vec()
 }
