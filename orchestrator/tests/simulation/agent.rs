@@ -91,6 +91,8 @@ pub struct AgentProcess {
     next: u64,
     leaving: bool,
     stopped_until: Time,
+    /// Its heartbeat is missing until then.
+    muted_until: Time,
 }
 
 /// The number of a request says where its reply goes.
@@ -125,6 +127,7 @@ impl World {
             next: 0,
             leaving: false,
             stopped_until: 0,
+            muted_until: 0,
         };
         self.agents.insert(agent, started);
         self.after(500, Event::Agent(AgentKey { agent, process }, AgentEventKind::Starts));
@@ -250,19 +253,13 @@ impl World {
         exchange: SlotExchange,
         step: Result<SlotStep, LinkError>,
     ) {
-        let ignores = self.bug == Some(PlantedBug::AgentMixtureIgnored);
         let agent = self.agents.get_mut(&key.agent).unwrap();
         let end = match step {
             Ok(SlotStep::Continue) => {
                 agent.conversations.insert(number, Conversation::Slot(exchange));
                 return self.after(RETRY_DELAY, Event::Agent(key, AgentEventKind::Sends(number)));
             }
-            Ok(SlotStep::Done(Some(mut work))) => {
-                if ignores && let Some(newest) = agent.mixtures.back() {
-                    work.mixture = Arc::clone(newest);
-                }
-                ExchangeEnd::Work(Box::new(work))
-            }
+            Ok(SlotStep::Done(Some(work))) => ExchangeEnd::Work(Box::new(work)),
             Ok(SlotStep::Done(None)) => ExchangeEnd::Closed,
             Err(LinkError::RejoinRequired(_)) => ExchangeEnd::RejoinRequired,
             Err(why) => return self.agent_fails(key, &why),
@@ -353,7 +350,9 @@ impl World {
     }
 
     pub fn mute_agent(&mut self, agent: u32, until: Time) {
-        let Some(id) = self.agents.get(&agent).map(|agent| agent.info.id.clone()) else { return };
+        let Some(agent) = self.agents.get_mut(&agent) else { return };
+        agent.muted_until = agent.muted_until.max(until);
+        let id = agent.info.id.clone();
         self.set_agent_alive(&id, false);
         self.after(until - self.now, Event::AgentHeard(id));
     }
@@ -400,8 +399,12 @@ impl World {
     /// The server says what happened to an agent: one that works is not taken for another.
     pub fn agent_event(&mut self, session: u64, event: AgentEvent) {
         match event {
-            AgentEvent::Lost(agent) => {
-                self.tell(format!("run {session} has lost an agent on {}", agent.host))
+            AgentEvent::Lost(lost) => {
+                self.tell(format!("run {session} has lost an agent on {}", lost.host));
+                let lives = |agent: &AgentProcess| agent.info == lost && agent.muted_until < self.now;
+                if Some(session) == self.leader() && self.agents.values().any(lives) {
+                    self.fail(format!("the living agent on {} is taken for dead", lost.host));
+                }
             }
             AgentEvent::MessageRejected(why) => {
                 self.fail(format!("run {session} rejects a message of an agent: {why}"));

@@ -50,14 +50,12 @@ pub enum PlantedBug {
     AgentIdReused,
     /// An agent takes a late reply for one to its current request.
     LateReplyBelieved,
-    /// An agent gives its walkers the newest mixture that it has, instead of the one of the assignment.
-    AgentMixtureIgnored,
     /// An agent that has lost its registration starts again with the slots of the old one.
     OldSlotsKept,
 }
 
 impl PlantedBug {
-    pub const ALL: [Self; 24] = [
+    pub const ALL: [Self; 23] = [
         Self::AnswerBeforeCommit,
         Self::FailedCommitBelieved,
         Self::CommitRepeated,
@@ -80,7 +78,6 @@ impl PlantedBug {
         Self::AgentLossForgotten,
         Self::AgentIdReused,
         Self::LateReplyBelieved,
-        Self::AgentMixtureIgnored,
         Self::OldSlotsKept,
     ];
 }
@@ -89,11 +86,9 @@ impl PlantedBug {
     /// The first seed of those that can find it.
     pub fn first_seed(self) -> u64 {
         match self {
-            Self::AgentLossForgotten
-            | Self::AgentIdReused
-            | Self::LateReplyBelieved
-            | Self::AgentMixtureIgnored
-            | Self::OldSlotsKept => AGENT_SEEDS,
+            Self::AgentLossForgotten | Self::AgentIdReused | Self::LateReplyBelieved | Self::OldSlotsKept => {
+                AGENT_SEEDS
+            }
             _ => 0,
         }
     }
@@ -119,7 +114,9 @@ impl PlantedBug {
             Self::IncarnationIgnored => 32,
             Self::PauseRemembered => 50,
             Self::CalculationRecordedLate => 57,
-            _ => self.first_seed(),
+            Self::AgentLossForgotten => AGENT_SEEDS,
+            Self::LateReplyBelieved | Self::OldSlotsKept => AGENT_SEEDS + 1,
+            Self::AgentIdReused => self.first_seed(),
         }
     }
 }
