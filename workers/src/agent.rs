@@ -1,5 +1,6 @@
 //! The agent of a host: dispatches assignments of a campaign on another host to local walkers.
 
+mod agent_core;
 mod metrics;
 mod pool;
 
@@ -19,8 +20,8 @@ use wire::messages::{AssignmentReport, WalkProgress};
 use wire::net::{AgentClient, LinkError, Membership, Slot, SlotReport};
 use wire::transport::{Incoming, WorkItem};
 
+pub use self::agent_core::{AgentCore, ExchangeEnd};
 pub use self::metrics::{AgentMetrics, AssignmentCounts};
-use self::pool::AssignmentPool;
 
 /// Time between two queries whether the orchestrator wants its agents to stop.
 const POLL_INTERVAL: Duration = Duration::from_secs(2);
@@ -84,16 +85,12 @@ type StopReply = (Result<Option<bool>, LinkError>, Duration);
 struct ExchangeState {
     client: Arc<AgentClient>,
     joined: Arc<Membership>,
-    pool: AssignmentPool,
+    core: AgentCore<Membership>,
     in_flight: FuturesUnordered<BoxFuture<'static, ExchangeResult>>,
-    /// Number of exchanges in flight that deliver something.
-    delivering: usize,
     /// The pending query whether to stop.
     stop_query: Option<BoxFuture<'static, StopReply>>,
-    /// A new registration in progress, after this one was lost …
+    /// A new registration in progress.
     joining: Option<BoxFuture<'static, Result<Membership, LinkError>>>,
-    /// … which takes effect when every exchange of the old one is complete.
-    next_joined: Option<Membership>,
     /// When the orchestrator last replied.
     heard: Instant,
     metrics: Arc<Mutex<AgentMetrics>>,
@@ -129,7 +126,7 @@ impl Agent {
                     let joined = joined?;
                     if joined.setup != state.joined.setup {
                         // Its walkers have other settings or another model, and so have their reports.
-                        state.pool.dismiss_idle();
+                        state.core.dismiss_idle();
                         joined.leave().await;
                         return Ok(AgentExit::SetupChanged);
                     }
@@ -140,19 +137,19 @@ impl Agent {
                 () = &mut stop => {}
                 // The orchestrator no longer knew of this agent, or it would have waited.
                 () = &mut over => {
-                    state.pool.dismiss_idle();
+                    state.core.dismiss_idle();
                     return Ok(AgentExit::Done);
                 }
             }
             if self.stopping.is_cancelled() {
-                state.pool.dismiss_idle();
-                if state.pool.is_idle() {
+                state.core.dismiss_idle();
+                if state.core.pool.is_idle() {
                     break;
                 }
-            } else if state.pool.is_over() {
+            } else if state.core.is_over() {
                 // The campaign is over or being stopped.
                 let stopped = matches!(state.joined.is_stopping().await, Ok(Some(true)));
-                state.pool.dismiss_idle();
+                state.core.dismiss_idle();
                 state.joined.leave().await;
                 return Ok(if stopped { AgentExit::Stopped } else { AgentExit::Done });
             }
@@ -181,12 +178,10 @@ impl ExchangeState {
         Self {
             client,
             joined: Arc::new(joined),
-            pool: AssignmentPool::default(),
+            core: AgentCore::default(),
             in_flight: FuturesUnordered::new(),
-            delivering: 0,
             stop_query: None,
             joining: None,
-            next_joined: None,
             heard: Instant::now(),
             metrics,
             silence: None,
@@ -207,14 +202,13 @@ impl ExchangeState {
     fn start(&mut self, slots: Vec<Slot>) {
         self.mark_heard();
         self.metrics().joins += 1;
-        for (slot, report) in self.pool.start(slots) {
+        for (slot, report) in self.core.start(slots) {
             self.exchange(slot, report);
         }
     }
 
     /// Starts to deliver the result of a slot's assignment and to ask for the next one.
     fn exchange(&mut self, mut slot: Slot, report: SlotReport) {
-        self.delivering += usize::from(!matches!(report, SlotReport::Empty));
         let joined = Arc::clone(&self.joined);
         self.in_flight.push(Box::pin(async move {
             let result = slot.exchange(&joined, &report).await;
@@ -223,21 +217,17 @@ impl ExchangeState {
     }
 
     fn handle(&mut self, message: Incoming) {
-        let next = match message {
+        match &message {
             Incoming::Progress(walk, progress) => {
-                self.metrics().record_progress(walk, &progress);
-                self.forward_progress(walk, progress);
-                None
+                self.metrics().record_progress(*walk, progress);
+                self.forward_progress(*walk, progress.clone());
             }
-            Incoming::Idle { walker, report, reply } => {
-                if let Some(AssignmentReport { walk, progress, .. }) = &report {
-                    self.metrics().record_progress(*walk, progress);
-                }
-                self.pool.walker_idle(walker, report, reply)
+            Incoming::Idle { report: Some(AssignmentReport { walk, progress, .. }), .. } => {
+                self.metrics().record_progress(*walk, progress);
             }
-            Incoming::Lost { walker, crashed } => self.pool.walker_lost(walker, crashed),
-        };
-        if let Some((slot, report)) = next {
+            _ => {}
+        }
+        if let Some((slot, report)) = self.core.handle(message) {
             self.exchange(slot, report);
         }
         self.update_metrics();
@@ -246,56 +236,43 @@ impl ExchangeState {
     /// Updates the number of waiting reports and idle walkers.
     fn update_metrics(&self) {
         let mut metrics = self.metrics();
-        (metrics.unsent, metrics.idle) = (self.unsent(), self.pool.idle());
-    }
-
-    /// Reports that the orchestrator has not accepted yet.
-    fn unsent(&self) -> usize {
-        self.delivering + self.pool.unsent()
+        (metrics.unsent, metrics.idle) = (self.core.unsent(), self.core.pool.idle());
     }
 
     fn exchanged(&mut self, (slot, report, result): ExchangeResult) -> Result<(), LinkError> {
         self.mark_heard();
-        self.delivering -= usize::from(!matches!(report, SlotReport::Empty));
         if result.is_ok() {
             self.metrics().delivered(&report);
         }
-        match result {
+        let end = match result {
             Ok(Some(work)) => {
                 self.metrics().received(&work.assignment, work.mixture.version());
-                self.pool.assign(slot, work);
+                ExchangeEnd::Work(Box::new(work))
             }
-            Ok(None) => self.pool.slot_closed(),
-            Err(LinkError::RejoinRequired(_)) => {
-                self.pool.keep_unsent(report);
-                self.rejoin();
-            }
+            Ok(None) => ExchangeEnd::Closed,
+            Err(LinkError::RejoinRequired(_)) => ExchangeEnd::RejoinRequired,
             Err(parted) => return Err(parted),
+        };
+        if self.core.exchanged(slot, report, end) {
+            self.join();
         }
         self.switch_session();
         self.update_metrics();
         Ok(())
     }
 
-    /// Registers again: this agent was taken for dead, or the orchestrator was restarted. Waiting reports are
-    /// delivered under the new registration.
-    fn rejoin(&mut self) {
-        if self.joining.is_none() && self.next_joined.is_none() {
-            let client = Arc::clone(&self.client);
-            self.joining = Some(Box::pin(async move { client.join().await }));
-        }
+    fn join(&mut self) {
+        let client = Arc::clone(&self.client);
+        self.joining = Some(Box::pin(async move { client.join().await }));
     }
 
     fn has_joined(&mut self, joined: Membership) {
-        self.next_joined = Some(joined);
+        self.core.has_joined(joined);
         self.switch_session();
     }
 
     fn switch_session(&mut self) {
-        if !self.in_flight.is_empty() {
-            return;
-        }
-        if let Some(joined) = self.next_joined.take() {
+        if let Some(joined) = self.core.take_joined() {
             let slots = joined.slots();
             self.joined = Arc::new(joined);
             self.start(slots);
@@ -316,8 +293,10 @@ impl ExchangeState {
                 (joined.is_stopping().await, asked.elapsed())
             })
         });
-        let now = (silence > UNRESPONSIVE_AFTER)
-            .then(|| OrchestratorEvent::Unresponsive { unsent: self.unsent(), idle: self.pool.idle() });
+        let now = (silence > UNRESPONSIVE_AFTER).then(|| OrchestratorEvent::Unresponsive {
+            unsent: self.core.unsent(),
+            idle: self.core.pool.idle(),
+        });
         let before = std::mem::replace(&mut self.silence, now);
         Ok(if now.is_none() {
             before.map(|_| OrchestratorEvent::Recovered)
@@ -333,7 +312,11 @@ impl ExchangeState {
     ) -> Result<bool, LinkError> {
         match reply {
             Ok(None) => return Ok(false),
-            Err(LinkError::RejoinRequired(_)) => self.rejoin(),
+            Err(LinkError::RejoinRequired(_)) => {
+                if self.core.rejoin() {
+                    self.join();
+                }
+            }
             Err(parted) => return Err(parted),
             Ok(Some(_)) => {}
         }
@@ -348,7 +331,7 @@ impl ExchangeState {
         if self.last_progress.get(&walk).is_some_and(|last| now.duration_since(*last) < PROGRESS_INTERVAL) {
             return;
         }
-        if let Some(slot) = self.pool.slot_of(walk) {
+        if let Some(slot) = self.core.pool.slot_of(walk) {
             self.last_progress.insert(walk, now);
             tokio::spawn(slot.progress(Arc::clone(&self.joined), walk, progress));
         }
@@ -357,9 +340,9 @@ impl ExchangeState {
     /// Waits until every report is delivered. Reports under a lost registration are not: the orchestrator treats
     /// their assignments as not started, and they start again.
     async fn flush(&mut self) {
-        while self.delivering > 0 {
+        while self.core.delivering() > 0 {
             let Some((_, report, _)) = self.in_flight.next().await else { return };
-            self.delivering -= usize::from(!matches!(report, SlotReport::Empty));
+            self.core.flushed(&report);
         }
     }
 }

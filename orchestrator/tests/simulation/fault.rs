@@ -11,6 +11,8 @@ pub type Time = u64;
 
 /// Faults begin before this time.
 const LAST_BEGIN: Time = 70_000;
+/// Links with this number and larger ones are those of agents.
+pub const FIRST_AGENT: u32 = 1_000;
 /// Longest time that a fault lasts.
 const LONGEST: Time = 40_000;
 
@@ -94,6 +96,26 @@ pub enum Fault {
     },
     /// A calculation is killed, with everything that it would have computed.
     KillCalculation,
+    /// An agent is killed, with its walkers, and started again.
+    KillAgent {
+        agent: u32,
+    },
+    /// An agent hangs; its heartbeat goes on.
+    StopAgent {
+        agent: u32,
+        until: Time,
+    },
+    /// The heartbeat of an agent is missing, although the agent works.
+    MuteAgent {
+        agent: u32,
+        until: Time,
+    },
+    /// A walker of an agent is killed.
+    KillAgentWalker {
+        agent: u32,
+        walker: u32,
+        crash: bool,
+    },
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -129,6 +151,25 @@ pub enum Moment {
 }
 
 impl Fault {
+    /// A fault of agents and their links.
+    fn draw_of_agents(random: &mut Random, scenario: &Scenario, at: Time) -> Self {
+        let agent = random.below(scenario.agents.into()) as u32;
+        let until = at + random.between(2_000, LONGEST);
+        match random.below(10) {
+            0..5 => {
+                let direction = [Direction::ToOrchestrator, Direction::ToWalker][random.below(2) as usize];
+                let troubles =
+                    [LinkTrouble::Cut, LinkTrouble::Loss, LinkTrouble::Delay, LinkTrouble::Repetition];
+                let trouble = troubles[random.below(4) as usize];
+                Self::Link { walker: FIRST_AGENT + agent, direction, trouble, until }
+            }
+            5..7 => Self::KillAgent { agent },
+            7 => Self::StopAgent { agent, until },
+            8 => Self::MuteAgent { agent, until },
+            _ => Self::KillAgentWalker { agent, walker: random.below(2) as u32, crash: random.happens(20) },
+        }
+    }
+
     fn draw(random: &mut Random, scenario: &Scenario, at: Time) -> Self {
         let walker = random.below(scenario.walkers.into()) as u32;
         let labeller = random.below(scenario.labellers.into()) as u32;
@@ -179,6 +220,8 @@ impl Fault {
             | Self::KillWalkerOften { until, .. }
             | Self::StopLabeller { until, .. }
             | Self::Hang { until }
+            | Self::StopAgent { until, .. }
+            | Self::MuteAgent { until, .. }
             | Self::PauseWalks { until } => *until,
             _ => at,
         }
@@ -192,14 +235,16 @@ pub fn plan(seed: u64, scenario: &Scenario) -> Vec<PlannedFault> {
     let mut plan: Vec<PlannedFault> = (0..number)
         .map(|_| {
             let at = random.below(LAST_BEGIN);
-            PlannedFault { at, fault: Fault::draw(&mut random, scenario, at) }
+            let of_agents = scenario.agents > 0 && random.happens(60);
+            let draw = if of_agents { Fault::draw_of_agents } else { Fault::draw };
+            PlannedFault { at, fault: draw(&mut random, scenario, at) }
         })
         .collect();
     plan.sort_by_key(|planned| planned.at);
     // A third crash in the same assignment would end its walk, and a reproducible campaign would differ.
     let mut crashes = 0;
     for PlannedFault { fault, .. } in &mut plan {
-        if let Fault::KillWalker { crash, .. } = fault {
+        if let Fault::KillWalker { crash, .. } | Fault::KillAgentWalker { crash, .. } = fault {
             crashes += u32::from(*crash);
             *crash &= crashes <= 2;
         }
@@ -218,9 +263,13 @@ impl fmt::Display for Fault {
                     LinkTrouble::Delay => "messages are late",
                     LinkTrouble::Repetition => "messages are repeated",
                 };
+                let end = match walker.checked_sub(FIRST_AGENT) {
+                    Some(agent) => format!("agent {agent}"),
+                    None => format!("walker {walker}"),
+                };
                 let way = match direction {
-                    Direction::ToOrchestrator => format!("from walker {walker} to the orchestrator"),
-                    Direction::ToWalker => format!("from the orchestrator to walker {walker}"),
+                    Direction::ToOrchestrator => format!("from {end} to the orchestrator"),
+                    Direction::ToWalker => format!("from the orchestrator to {end}"),
                 };
                 write!(f, "{what} {way}, until {} s", seconds(until))
             }
@@ -272,6 +321,14 @@ impl fmt::Display for Fault {
                 write!(f, "a person pauses all walks until {} s", seconds(until))
             }
             Self::KillCalculation => f.write_str("a calculation is killed"),
+            Self::KillAgent { agent } => write!(f, "agent {agent} is killed"),
+            Self::StopAgent { agent, until } => write!(f, "agent {agent} hangs until {} s", seconds(until)),
+            Self::MuteAgent { agent, until } => {
+                write!(f, "the heartbeat of agent {agent} is missing until {} s", seconds(until))
+            }
+            Self::KillAgentWalker { agent, walker, .. } => {
+                write!(f, "walker {walker} of agent {agent} is killed")
+            }
         }
     }
 }

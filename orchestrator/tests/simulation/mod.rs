@@ -7,6 +7,7 @@
 //! `CALMWALK_SEEDS=10000` simulates so many seeds, `CALMWALK_SEED=17` one seed, with its story. `CALMWALK_BUG=TornMixture`
 //! looks for one planted bug only.
 
+mod agent;
 mod calculation;
 mod fault;
 mod faulty_store;
@@ -29,12 +30,14 @@ use tempfile::TempDir;
 
 use self::fault::{PlannedFault, plan};
 use self::planted::PlantedBug;
-use self::scenario::{SEED_STRUCTURES, Scenario};
+use self::scenario::{AGENT_SEEDS, SEED_STRUCTURES, Scenario};
 use self::world::{Outcome, World};
 use crate::common::{CAMPAIGN, seed_structure};
 
 /// Number of seeds that the tests simulate.
 const SEEDS: u64 = 64;
+/// The same with agents.
+const SEEDS_WITH_AGENTS: u64 = 24;
 /// A planted bug must be found within this number of seeds.
 const SEEDS_TO_FIND: u64 = 1_000;
 
@@ -134,14 +137,23 @@ fn no_seed_breaks_an_invariant() {
         println!("{}", outcome.story.join("\n"));
         return;
     }
-    let seeds = number_in("CALMWALK_SEEDS").unwrap_or(SEEDS);
-    let (mut events, mut time) = (0, 0);
-    for seed in 0..seeds {
+    check_seeds(0..number_in("CALMWALK_SEEDS").unwrap_or(SEEDS));
+}
+
+/// The same with agents on other hosts.
+#[test]
+fn no_seed_with_agents_breaks_an_invariant() {
+    check_seeds(AGENT_SEEDS..AGENT_SEEDS + number_in("CALMWALK_SEEDS").unwrap_or(SEEDS_WITH_AGENTS));
+}
+
+fn check_seeds(seeds: std::ops::Range<u64>) {
+    let (mut events, mut time, number) = (0, 0, seeds.end - seeds.start);
+    for seed in seeds {
         let outcome = check(seed);
         events += outcome.events;
         time += outcome.ended;
     }
-    println!("{seeds} seeds, {events} events, {} h of virtual time", time / 3_600_000);
+    println!("{number} seeds, {events} events, {} h of virtual time", time / 3_600_000);
 }
 
 #[test]
@@ -167,7 +179,7 @@ fn planted_bugs_are_found() {
         PlantedBug::ALL.into_iter().filter(|bug| only.as_ref().is_none_or(|only| *only == format!("{bug:?}")))
     {
         let first = (!all).then(|| bug.found_by());
-        let seeds = first.into_iter().chain(0..SEEDS_TO_FIND);
+        let seeds = first.into_iter().chain(bug.first_seed()..bug.first_seed() + SEEDS_TO_FIND);
         let found = { seeds }.find_map(|seed| Some((seed, broken_by(seed, bug)?)));
         match found {
             Some((seed, broken)) => println!("{bug:?}: seed {seed}: {broken}"),

@@ -1,6 +1,8 @@
 //! Mistakes that are made on purpose, to see that the simulation finds them. They are made at the edges, never in the
 //! program itself.
 
+use super::scenario::AGENT_SEEDS;
+
 /// A mistake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum PlantedBug {
@@ -42,10 +44,18 @@ pub enum PlantedBug {
     MixtureForgotten,
     /// Labellers are not told of the budget.
     BudgetForgotten,
+    /// The orchestrator does not remove agents that are silent for too long.
+    AgentLossForgotten,
+    /// Every process of an agent has the same id, so late messages of dead ones are believed.
+    AgentIdReused,
+    /// An agent takes a late reply for one to its current request.
+    LateReplyBelieved,
+    /// An agent that has lost its registration starts again with the slots of the old one.
+    OldSlotsKept,
 }
 
 impl PlantedBug {
-    pub const ALL: [Self; 19] = [
+    pub const ALL: [Self; 23] = [
         Self::AnswerBeforeCommit,
         Self::FailedCommitBelieved,
         Self::CommitRepeated,
@@ -65,10 +75,24 @@ impl PlantedBug {
         Self::KnownStructuresForgotten,
         Self::MixtureForgotten,
         Self::BudgetForgotten,
+        Self::AgentLossForgotten,
+        Self::AgentIdReused,
+        Self::LateReplyBelieved,
+        Self::OldSlotsKept,
     ];
 }
 
 impl PlantedBug {
+    /// The first seed of those that can find it.
+    pub fn first_seed(self) -> u64 {
+        match self {
+            Self::AgentLossForgotten | Self::AgentIdReused | Self::LateReplyBelieved | Self::OldSlotsKept => {
+                AGENT_SEEDS
+            }
+            _ => 0,
+        }
+    }
+
     /// A seed that finds it, with which the search begins.
     pub fn found_by(self) -> u64 {
         match self {
@@ -90,6 +114,9 @@ impl PlantedBug {
             Self::IncarnationIgnored => 32,
             Self::PauseRemembered => 50,
             Self::CalculationRecordedLate => 57,
+            Self::AgentLossForgotten => AGENT_SEEDS,
+            Self::LateReplyBelieved | Self::OldSlotsKept => AGENT_SEEDS + 1,
+            Self::AgentIdReused => self.first_seed(),
         }
     }
 }

@@ -13,8 +13,10 @@ use store::records::{Commit, Fate};
 use store::{CampaignLock, ProcessRecord, Store, StoreError};
 use tokio_util::sync::CancellationToken;
 use wire::datagram::{AnswerDatagram, DatagramServer};
+use wire::net::datagram::AgentDatagramServer;
 use wire::transport::WorkItem;
 
+use super::agent::AGENT_TIMEOUT;
 use super::fault::{ClientKind, Direction, Time};
 use super::faulty_store::CommitTry;
 use super::labeller::ATTEMPTS;
@@ -53,6 +55,8 @@ pub enum RunLock {
 pub struct Run {
     core: ReactorCore,
     server: DatagramServer,
+    /// The server of agents on other hosts.
+    pub agents: AgentDatagramServer,
     walkers: Supervisor,
     labellers: Supervisor,
     /// The process behind each number of a labeller, and its last heartbeat.
@@ -97,8 +101,16 @@ impl World {
             Ok((core, stopping)) => {
                 self.tell(format!("run {session} begins"));
                 let limits = Limits { detached: true, ..LIMITS };
+                let agents = AgentDatagramServer::new(
+                    session,
+                    AGENT_TIMEOUT,
+                    Arc::clone(core.selector().mixture()),
+                    core.selector().original(),
+                    stopping.clone(),
+                );
                 let run = Run {
                     core,
+                    agents,
                     server: DatagramServer::new(session),
                     walkers: Supervisor::new(self.scenario.walkers, LIMITS),
                     labellers: Supervisor::new(
@@ -121,6 +133,9 @@ impl World {
                 self.runs.insert(session, run);
                 self.adopt_labellers(session);
                 self.after(0, Event::RunSupervises(session));
+                if self.scenario.agents > 0 {
+                    self.after(0, Event::AgentExpiry(session));
+                }
                 self.after(HEARTBEAT_INTERVAL, Event::RunHeartbeat(session));
             }
             Err(error) => {
@@ -176,7 +191,7 @@ impl World {
     }
 
     /// Whether a run is there and does not hang; if it hangs, the event comes later.
-    fn is_active(&mut self, session: u64, event: impl FnOnce() -> Event) -> bool {
+    pub fn is_active(&mut self, session: u64, event: impl FnOnce() -> Event) -> bool {
         let Some(run) = self.runs.get(&session) else { return false };
         let until = run.stopped_until;
         if until > self.now {
@@ -210,7 +225,7 @@ impl World {
     }
 
     /// Lets everything happen that needs no time: answers, decisions, the next assignments.
-    fn pump(&mut self, session: u64) {
+    pub fn pump(&mut self, session: u64) {
         self.deliver(session);
         self.advance(session);
         self.deliver(session);
@@ -224,8 +239,12 @@ impl World {
             let Some(run) = self.runs.get_mut(&session) else { return };
             let mut sent = Vec::new();
             run.server.answer_decided(|work| sent.push(work.clone()));
+            run.agents.answer_decided(|work| sent.push(work.clone()));
             let answers = run.server.take_answers();
-            let incoming = run.server.take_incoming();
+            let mut incoming = run.server.take_incoming();
+            incoming.extend(run.agents.take_incoming());
+            let replies = run.agents.take_replies();
+            let told = run.agents.take_events();
             sent.into_iter().for_each(|work| self.assignment_leaves(session, work));
             for AnswerDatagram { walker, incarnation, bytes } in answers {
                 let newest = self.runs[&session].incarnations.get(&walker).copied();
@@ -236,6 +255,8 @@ impl World {
                 let to = WalkerKey { session, number: walker, incarnation };
                 self.send(Direction::ToWalker, walker, Event::ToWalker { to, bytes });
             }
+            told.into_iter().for_each(|event| self.agent_event(session, event));
+            replies.into_iter().for_each(|(request, bytes)| self.reply_leaves(request, bytes));
             if incoming.len() > MAX_INCOMING {
                 self.fail(format!("{} messages wait for the reactor", incoming.len()));
             }
@@ -569,7 +590,7 @@ impl World {
     fn end_if_over(&mut self, session: u64) {
         let (now, wall) = (self.now, self.wall_clock());
         let Some(run) = self.runs.get(&session) else { return };
-        if !(run.finished && run.walkers.is_over() && run.labellers.is_over()) {
+        if !(run.finished && run.walkers.is_over() && run.labellers.is_over() && run.agents.has_no_agents()) {
             return;
         }
         let id = run.record.id.clone();

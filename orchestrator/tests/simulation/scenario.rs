@@ -7,8 +7,10 @@ use super::random::Random;
 use crate::common::scripted::{Event, Script};
 use crate::common::settings;
 
-/// Number of scenarios.
+/// Number of scenarios without agents.
 pub const SCENARIOS: u64 = 8;
+/// Seeds from this one on have agents on other hosts.
+pub const AGENT_SEEDS: u64 = 1 << 32;
 /// Number of seed structures.
 pub const SEED_STRUCTURES: usize = 3;
 
@@ -19,6 +21,8 @@ pub struct Scenario {
     pub settings: SelectorSettings,
     pub scripts: Vec<Script>,
     pub walkers: u32,
+    /// Agents on other hosts, each with two walkers and an assignment in reserve.
+    pub agents: u32,
     pub labellers: u32,
     /// Walkers wait while more label jobs are unfinished.
     pub queue_limit: u64,
@@ -31,7 +35,8 @@ pub struct Scenario {
 impl Scenario {
     /// The scenario of a seed.
     pub fn of(seed: u64) -> Self {
-        let number = seed % SCENARIOS;
+        let has_agents = seed >= AGENT_SEEDS;
+        let number = seed % SCENARIOS + if has_agents { AGENT_SEEDS } else { 0 };
         let mut random = Random::new(1000 + number);
         let mode = if number.is_multiple_of(2) { CampaignMode::Reproducible } else { CampaignMode::Live };
         let settings = SelectorSettings {
@@ -45,7 +50,8 @@ impl Scenario {
             number,
             settings,
             scripts: (0..SEED_STRUCTURES).map(|_| script(&mut random)).collect(),
-            walkers: random.between(2, 4) as u32,
+            walkers: if has_agents { 1 } else { random.between(2, 4) as u32 },
+            agents: if has_agents { 2 } else { 0 },
             labellers: random.between(1, 2) as u32,
             // A used-up budget ends a run in earnest; here the queue stays.
             queue_limit: if label_budget.is_none() && random.happens(60) { 3 } else { 1000 },

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use sqlx::SqliteConnection;
 use store::{Budget, ProcessRecord, RelabelRequest, Store};
 
+use super::agent::{AgentEventKind, AgentKey, AgentProcess};
 use super::calculation::Calculation;
 use super::fault::{ClientKind, Direction, Fault, LinkTrouble, PlannedFault, Time};
 use super::faulty_store::FaultyStore;
@@ -67,6 +68,13 @@ pub enum Event {
     /// A run learns that a labeller with this record has ended.
     LabellerGone(u32, String, Exit),
     CalculationEnds(String),
+    Agent(AgentKey, AgentEventKind),
+    /// A request of an agent arrives at the run that leads.
+    AgentRequest(AgentKey, u64, Vec<u8>),
+    /// The heartbeat of an agent with this id is there again.
+    AgentHeard(String),
+    /// A run looks for silent agents.
+    AgentExpiry(u64),
 }
 
 /// Something that happens at a time; of two at the same time, what was planned first.
@@ -124,6 +132,7 @@ pub struct World {
     pub directory: std::path::PathBuf,
     pub runs: BTreeMap<u64, Run>,
     pub walkers: BTreeMap<WalkerKey, WalkerProcess>,
+    pub agents: BTreeMap<u32, AgentProcess>,
     pub labellers: BTreeMap<u32, Labeller>,
     pub calculations: BTreeMap<String, Calculation>,
     pub known: Known,
@@ -164,6 +173,7 @@ impl World {
             directory: directory.to_owned(),
             runs: BTreeMap::new(),
             walkers: BTreeMap::new(),
+            agents: BTreeMap::new(),
             labellers: BTreeMap::new(),
             calculations: BTreeMap::new(),
             known: Known::default(),
@@ -182,6 +192,9 @@ impl World {
             hasher: DefaultHasher::new(),
         };
         world.after(0, Event::StartRun);
+        for agent in 0..world.scenario.agents {
+            world.start_agent(agent, 1);
+        }
         for (number, planned) in world.plan.clone().into_iter().enumerate() {
             world.after(planned.at, Event::Fault(number));
         }
@@ -316,6 +329,10 @@ impl World {
             Event::LabellerHeartbeat(id) => self.labeller_heartbeat(id),
             Event::LabellerGone(id, record, exit) => self.labeller_gone(id, record, exit),
             Event::CalculationEnds(id) => self.calculation_ends(&id),
+            Event::Agent(key, kind) => self.agent_acts(key, kind),
+            Event::AgentRequest(key, request, bytes) => self.agent_request_arrives(key, request, bytes),
+            Event::AgentHeard(id) => self.agent_heard(&id),
+            Event::AgentExpiry(session) => self.agents_expire(session),
         }
     }
 
@@ -384,6 +401,10 @@ impl World {
                 self.at(until, Event::Resume);
             }
             Fault::KillCalculation => self.kill_calculation(),
+            Fault::KillAgent { agent } => self.kill_agent(agent),
+            Fault::StopAgent { agent, until } => self.stop_agent(agent, until),
+            Fault::MuteAgent { agent, until } => self.mute_agent(agent, until),
+            Fault::KillAgentWalker { agent, walker, crash } => self.kill_agent_walker(agent, walker, crash),
         }
     }
 

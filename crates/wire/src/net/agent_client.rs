@@ -16,10 +16,11 @@ use zerocopy::IntoBytes;
 use super::NetError;
 use super::address::{Address, Announcement};
 use super::certificates::Tls;
-use super::delta::{DeltaError, DeltaReceiver};
+use super::delta::DeltaError;
 use super::endpoint::{self, Endpoint};
 use super::handshake;
 use super::message::{AGENTS, AgentInfo, AgentReply, AgentRequest, ORCHESTRATOR};
+use super::mixture_fetch::MixtureFetch;
 use super::side::ConnectionSide;
 use crate::control::{ControlError, decode, encode};
 use crate::mixture::ORIGINAL;
@@ -230,30 +231,13 @@ impl AgentClient {
         base: Option<&Arc<Mixture>>,
         wanted: u64,
     ) -> Result<Mixture, LinkError> {
-        let have = base.map(|base| base.version());
-        let mut receiver: Option<DeltaReceiver> = None;
+        let mut fetch = MixtureFetch::new(session, base.cloned(), wanted);
         loop {
-            let skip = receiver.as_ref().map_or(0, DeltaReceiver::received);
-            let request = AgentRequest::Mixture { session, have, wanted, skip };
-            let answer = self.request(&request).await?;
-            let AgentReply::Mixture(part) = decode_reply(&answer)? else { return Err(unexpected("mixture")) };
-            let received = match &mut receiver {
-                Some(received) if received.is_next(&part) => received,
-                // The orchestrator has discarded the base version in the meantime: start over without it.
-                Some(_) => {
-                    receiver = None;
-                    continue;
-                }
-                None => receiver.insert(DeltaReceiver::new(
-                    &part,
-                    base.filter(|_| part.from.is_some()).map(|base| &**base),
-                )?),
-            };
-            if received.add_part(&part)? {
-                break;
+            let answer = self.request(&fetch.request()).await?;
+            if let Some(mixture) = fetch.receive(&answer)? {
+                return Ok(mixture);
             }
         }
-        Ok(receiver.expect("the loop ends with one").finish()?)
     }
 
     /// Sends a request once; `None` if there is no answer in time, or no link.
@@ -304,7 +288,7 @@ pub(super) fn decode_reply(answer: &[u8]) -> Result<AgentReply<'_>, LinkError> {
     }
 }
 
-fn unexpected(to: &str) -> LinkError {
+pub(super) fn unexpected(to: &str) -> LinkError {
     LinkError::InvalidReply(format!("it does not match the request ({to})"))
 }
 

@@ -9,6 +9,7 @@ use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 use zenoh::Session;
+use zenoh::bytes::ZBytes;
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::pubsub::Subscriber;
 use zenoh::query::{Query, Queryable};
@@ -18,6 +19,7 @@ use super::agent_event::AgentEvent;
 use super::certificates::Tls;
 use super::endpoint::{self, Endpoint};
 use super::message::{AGENTS, ORCHESTRATOR};
+use super::replies::Replies;
 use super::session::{AgentMixtures, AgentSession};
 use super::side::ConnectionSide;
 use super::{AgentBootstrap, NetError};
@@ -94,8 +96,14 @@ impl AgentServer {
         mut on_event: impl FnMut(AgentEvent) + Send + 'static,
     ) -> Result<(), NetError> {
         let mixtures = AgentMixtures::new(mixture, &original);
-        let mut state =
-            AgentSession::new(self.session_id, self.agent_timeout, self.bootstrap, mixtures, stopping);
+        let mut state = AgentSession::new(
+            self.session_id,
+            Replies::default(),
+            self.agent_timeout,
+            self.bootstrap,
+            mixtures,
+            stopping,
+        );
         let mut is_closing = false;
         let mut expiry = tokio::time::interval(EXPIRY_INTERVAL);
         expiry.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -117,7 +125,8 @@ impl AgentServer {
                 }
                 query = self.queries.recv_async() => {
                     let query = query.map_err(|why| NetError::SessionClosed { why: why.to_string() })?;
-                    state.receive(&query);
+                    let payload = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
+                    state.receive(&query, &payload);
                 }
                 _ = expiry.tick() => state.expire(Instant::now()),
             }

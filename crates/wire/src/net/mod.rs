@@ -20,11 +20,14 @@ mod agent_client;
 mod agent_event;
 mod agent_server;
 mod certificates;
+#[doc(hidden)]
+pub mod datagram;
 mod delta;
 mod endpoint;
 mod files;
 mod handshake;
 mod message;
+mod mixture_fetch;
 mod registry;
 mod replies;
 mod session;

@@ -16,6 +16,8 @@ pub(super) struct AgentRegistry {
     timeout: Duration,
     next_slot: u32,
     agents: BTreeMap<AgentId, RegisteredAgent>,
+    /// Agents whose heartbeat disappeared and is not back, with the time. Their requests may still be in the queue.
+    silent: BTreeMap<AgentId, Instant>,
 }
 
 /// An agent that has joined.
@@ -36,7 +38,7 @@ impl RegisteredAgent {
 
 impl AgentRegistry {
     pub(super) fn new(timeout: Duration) -> Self {
-        Self { timeout, next_slot: FIRST_SLOT, agents: BTreeMap::new() }
+        Self { timeout, next_slot: FIRST_SLOT, agents: BTreeMap::new(), silent: BTreeMap::new() }
     }
 
     /// Registers an agent with new slots; `None` if there are not enough numbers left. An agent that is already
@@ -45,7 +47,9 @@ impl AgentRegistry {
         let first_slot = self.next_slot;
         self.next_slot = first_slot.checked_add(agent.slots())?;
         let id = agent.id.clone();
-        let registered = RegisteredAgent { agent, first_slot, silent_since: None };
+        // An agent that has died since it sent its request must be lost like any other.
+        let silent_since = self.silent.get(&id).copied();
+        let registered = RegisteredAgent { agent, first_slot, silent_since };
         Some(self.agents.entry(id).insert_entry(registered).into_mut())
     }
 
@@ -56,6 +60,10 @@ impl AgentRegistry {
 
     /// Updates whether the agent's heartbeat is present. Returns the agent if this changed.
     pub(super) fn set_alive(&mut self, id: &str, alive: bool, now: Instant) -> Option<&AgentInfo> {
+        match alive {
+            true => drop(self.silent.remove(id)),
+            false => drop(self.silent.entry(id.to_owned()).or_insert(now)),
+        }
         let registered = self.agents.get_mut(id)?;
         if alive == registered.silent_since.is_none() {
             return None;
@@ -74,10 +82,14 @@ impl AgentRegistry {
         let dead = |registered: &RegisteredAgent| {
             registered.silent_since.is_some_and(|since| now.duration_since(since) >= timeout)
         };
-        self.agents
-            .extract_if(.., |_, registered| dead(registered))
+        let dead: Vec<_> = { self.agents.extract_if(.., |_, registered| dead(registered)) }
             .map(|(_, registered)| registered)
-            .collect()
+            .collect();
+        // One that lives and joins again has the whole time again.
+        for registered in &dead {
+            self.silent.insert(registered.agent.id.clone(), now);
+        }
+        dead
     }
 }
 
@@ -105,6 +117,21 @@ mod tests {
         assert_eq!(registry.join(agent("a", 2)).unwrap().slots(), FIRST_SLOT + 5..FIRST_SLOT + 8);
         assert_eq!(registry.leave("c"), None);
         assert_eq!(registry.join(agent("c", u32::MAX)), None);
+    }
+
+    #[test]
+    fn an_agent_that_died_before_its_request_was_handled_expires() {
+        let mut registry = AgentRegistry::new(Duration::from_secs(60));
+        let (start, second) = (Instant::now(), Duration::from_secs(1));
+        assert_eq!(registry.set_alive("a", false, start), None, "it has not joined yet");
+        registry.join(agent("a", 2));
+        assert_eq!(registry.expire(start + 59 * second), []);
+        assert_eq!(registry.expire(start + 60 * second).len(), 1);
+        // It lives after all: it has the whole time again, and longer if its heartbeat is back.
+        registry.join(agent("a", 2));
+        assert_eq!(registry.expire(start + 119 * second), []);
+        assert!(registry.set_alive("a", true, start + 119 * second).is_some());
+        assert_eq!(registry.expire(start + 1000 * second), []);
     }
 
     #[test]

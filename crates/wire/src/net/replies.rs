@@ -9,15 +9,17 @@ use crate::control::encode;
 use crate::protocol::message::{Answer, SenderId};
 use crate::protocol::server_session::ServerTransport;
 
+/// What a transport does for the server of agents, besides answers about slots.
+pub(super) trait AgentTransport: ServerTransport {
+    /// Replies to a request. If the reply is lost, the agent repeats its request.
+    fn reply(&mut self, request: &Self::Request, reply: &AgentReply<'_>);
+}
+
 /// The replies being sent. A broken link delays only its own.
 #[derive(Default)]
 pub(super) struct Replies(JoinSet<()>);
 
 impl Replies {
-    pub(super) fn reply(&mut self, query: &Query, reply: &AgentReply<'_>) {
-        self.spawn(query, encode(reply));
-    }
-
     /// If the reply is lost, the agent repeats its request.
     fn spawn(&mut self, query: &Query, reply: Vec<u8>) {
         while self.0.try_join_next().is_some() {}
@@ -28,6 +30,12 @@ impl Replies {
     /// Waits until all replies are sent.
     pub(super) async fn finish(mut self) {
         while self.0.join_next().await.is_some() {}
+    }
+}
+
+impl AgentTransport for Replies {
+    fn reply(&mut self, query: &Query, reply: &AgentReply<'_>) {
+        self.spawn(query, encode(reply));
     }
 }
 

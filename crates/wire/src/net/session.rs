@@ -6,8 +6,6 @@ use std::time::{Duration, Instant};
 
 use calm::Mixture;
 use tokio_util::sync::CancellationToken;
-use zenoh::bytes::ZBytes;
-use zenoh::query::Query;
 
 use super::AgentBootstrap;
 use super::agent_event::AgentEvent;
@@ -15,7 +13,7 @@ use super::delta::{self, MixtureDelta};
 use super::files::Files;
 use super::message::{AgentInfo, AgentReply, AgentRequest, JoinReply};
 use super::registry::{AgentRegistry, RegisteredAgent};
-use super::replies::Replies;
+use super::replies::{AgentTransport, Replies};
 use crate::control::decode;
 use crate::mixture::ORIGINAL;
 use crate::protocol::frame;
@@ -29,9 +27,9 @@ const INCARNATION: u32 = 1;
 /// Number of recent mixture versions to keep as bases of deltas.
 const MAX_VERSIONS: usize = 64;
 
-pub(super) struct AgentSession {
+pub(super) struct AgentSession<T: AgentTransport> {
     /// The slots of all agents.
-    pub(super) slots: ServerSession<Replies>,
+    pub(super) slots: ServerSession<T>,
     /// Events to be reported.
     pub(super) events: Vec<AgentEvent>,
     session: u64,
@@ -69,16 +67,17 @@ impl AgentMixtures {
     }
 }
 
-impl AgentSession {
+impl<T: AgentTransport> AgentSession<T> {
     pub(super) fn new(
         session: u64,
+        transport: T,
         agent_timeout: Duration,
         AgentBootstrap { setup, files }: AgentBootstrap,
         mixtures: AgentMixtures,
         stopping: CancellationToken,
     ) -> Self {
         Self {
-            slots: ServerSession::new(session, Replies::default()),
+            slots: ServerSession::new(session, transport),
             events: Vec::new(),
             session,
             setup,
@@ -90,9 +89,8 @@ impl AgentSession {
     }
 
     /// Handles a request.
-    pub(super) fn receive(&mut self, query: &Query) {
-        let payload = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
-        let Err(why) = self.dispatch(query, &payload) else { return };
+    pub(super) fn receive(&mut self, query: &T::Request, payload: &[u8]) {
+        let Err(why) = self.dispatch(query, payload) else { return };
         let reason = why.to_string();
         if let RejectedMessage::SenderMismatch(_) = why {
             // The agent will join again.
@@ -103,7 +101,7 @@ impl AgentSession {
         }
     }
 
-    fn dispatch(&mut self, query: &Query, payload: &[u8]) -> Result<(), RejectedMessage> {
+    fn dispatch(&mut self, query: &T::Request, payload: &[u8]) -> Result<(), RejectedMessage> {
         let (control, block) = frame::split(payload)?;
         match decode(control)? {
             AgentRequest::Join(agent) => self.join(query, agent)?,
@@ -138,7 +136,7 @@ impl AgentSession {
         Ok(())
     }
 
-    fn reply(&mut self, query: &Query, reply: &AgentReply<'_>) {
+    fn reply(&mut self, query: &T::Request, reply: &AgentReply<'_>) {
         self.slots.transport.reply(query, reply);
     }
 
@@ -148,7 +146,7 @@ impl AgentSession {
     }
 
     /// An agent that repeats its request because the answer was lost gets new slots.
-    fn join(&mut self, query: &Query, agent: AgentInfo) -> Result<(), RejectedMessage> {
+    fn join(&mut self, query: &T::Request, agent: AgentInfo) -> Result<(), RejectedMessage> {
         if let Some(member) = self.registry.leave(&agent.id) {
             self.agent_lost(&member);
         }
@@ -165,7 +163,7 @@ impl AgentSession {
 
     fn mixture(
         &mut self,
-        query: &Query,
+        query: &T::Request,
         have: Option<u64>,
         wanted: u64,
         skip: u32,
@@ -188,7 +186,7 @@ impl AgentSession {
     }
 
     /// Answers the pending offer of a slot.
-    pub(super) fn handle_decision(&mut self, decision: OfferDecision<Query>) {
+    pub(super) fn handle_decision(&mut self, decision: OfferDecision<T::Request>) {
         if let Some(WorkItem { mixture, .. }) = &decision.work {
             self.mixtures.add(mixture);
         }
@@ -219,7 +217,9 @@ impl AgentSession {
     pub(super) fn has_no_agents(&self) -> bool {
         self.registry.is_empty()
     }
+}
 
+impl AgentSession<Replies> {
     /// Waits until all answers are sent.
     pub(super) async fn finish(self) {
         self.slots.transport.finish().await;

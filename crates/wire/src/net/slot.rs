@@ -10,7 +10,7 @@ use super::message::{AgentReply, AgentRequest};
 use crate::block::CandidateBlock;
 use crate::control::{EncodedReport, checked_assignment, encode};
 use crate::ids::WalkId;
-use crate::messages::{AssignmentReport, Outcome, WalkProgress};
+use crate::messages::{Assignment, AssignmentReport, Outcome, WalkProgress};
 use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
 use crate::transport::WorkItem;
 
@@ -35,11 +35,23 @@ pub enum SlotReport {
     },
 }
 
+/// What the orchestrator answers about the current offer of a slot.
+#[derive(Clone, Debug)]
+pub(super) enum SlotAnswer {
+    /// The report is committed; the next assignment, with the version of its mixture.
+    Assignment(Box<Assignment>, u64),
+    /// There is no more work.
+    Shutdown,
+    /// The decision is pending: poll again.
+    Pending,
+    /// The offer was not received: send it again.
+    Unknown,
+}
+
 impl Membership {
     /// The slots of this agent.
     pub fn slots(&self) -> Vec<Slot> {
-        let sender = |walker| SenderId { session: self.session, walker, incarnation: 1 };
-        self.slot_numbers().map(|number| Slot { sender: sender(number), sequence: 0 }).collect()
+        self.slot_numbers().map(|number| Slot::new(self.session, number)).collect()
     }
 }
 
@@ -54,11 +66,9 @@ impl Slot {
         membership: &Membership,
         report: &SlotReport,
     ) -> Result<Option<WorkItem>, LinkError> {
-        self.sequence += 1;
+        self.begin_offer();
         let (offer, candidate) = self.offer(report);
-        let poll = encode(&AgentRequest::Envelope(Box::new(
-            self.envelope(Payload::Poll { sequence: self.sequence }),
-        )));
+        let poll = self.poll();
         let mut offered = false;
         loop {
             let sent_at = Instant::now();
@@ -73,24 +83,14 @@ impl Slot {
                 delay_retry(sent_at).await;
                 continue;
             };
-            let AgentReply::Answer(Answer { sequence, body }) = decode_reply(&answer)? else {
-                return Err(LinkError::InvalidReply("it is not an answer to an offer".to_owned()));
-            };
-            if sequence != self.sequence {
-                return Err(LinkError::InvalidReply(format!(
-                    "it answers offer {sequence}, not {}",
-                    self.sequence
-                )));
-            }
-            match body {
-                AnswerBody::Assignment { mixture_version, assignment } => {
-                    let assignment = checked_assignment(assignment.into_owned())?;
-                    let mixture = membership.mixture(mixture_version).await?;
-                    return Ok(Some(WorkItem { assignment, mixture }));
+            match self.read(&answer)? {
+                SlotAnswer::Assignment(assignment, version) => {
+                    let mixture = membership.mixture(version).await?;
+                    return Ok(Some(WorkItem { assignment: *assignment, mixture }));
                 }
-                AnswerBody::Shutdown => return Ok(None),
-                AnswerBody::Pending => delay_retry(sent_at).await,
-                AnswerBody::Unknown => offered = false,
+                SlotAnswer::Shutdown => return Ok(None),
+                SlotAnswer::Pending => delay_retry(sent_at).await,
+                SlotAnswer::Unknown => offered = false,
             }
         }
     }
@@ -107,11 +107,53 @@ impl Slot {
         async move { drop(membership.client().send_once(&request, None).await) }
     }
 
+    /// A slot of an agent that has joined, before its first offer.
+    pub(super) fn new(session: u64, number: u32) -> Self {
+        Self { sender: SenderId { session, walker: number, incarnation: 1 }, sequence: 0 }
+    }
+
+    /// Session of the orchestrator.
+    pub(super) fn session(&self) -> u64 {
+        self.sender.session
+    }
+
+    /// Begins the next offer.
+    pub(super) fn begin_offer(&mut self) {
+        self.sequence += 1;
+    }
+
+    /// A question about the current offer.
+    pub(super) fn poll(&self) -> Vec<u8> {
+        let poll = self.envelope(Payload::Poll { sequence: self.sequence });
+        encode(&AgentRequest::Envelope(Box::new(poll)))
+    }
+
+    /// Reads the answer to the current offer.
+    pub(super) fn read(&self, answer: &[u8]) -> Result<SlotAnswer, LinkError> {
+        let AgentReply::Answer(Answer { sequence, body }) = decode_reply(answer)? else {
+            return Err(LinkError::InvalidReply("it is not an answer to an offer".to_owned()));
+        };
+        if sequence != self.sequence {
+            let why = format!("it answers offer {sequence}, not {}", self.sequence);
+            return Err(LinkError::InvalidReply(why));
+        }
+        Ok(match body {
+            AnswerBody::Assignment { mixture_version, assignment } => {
+                let assignment = checked_assignment(assignment.into_owned())?;
+                SlotAnswer::Assignment(Box::new(assignment), mixture_version)
+            }
+            AnswerBody::Shutdown => SlotAnswer::Shutdown,
+            AnswerBody::Pending => SlotAnswer::Pending,
+            AnswerBody::Unknown => SlotAnswer::Unknown,
+        })
+    }
+
     fn envelope<'a>(&self, payload: Payload<'a>) -> Envelope<'a> {
         Envelope { sender: self.sender, payload }
     }
 
-    fn offer<'a>(&self, slot_report: &'a SlotReport) -> (Vec<u8>, Option<&'a [u8]>) {
+    /// The current offer, and its candidate.
+    pub(super) fn offer<'a>(&self, slot_report: &'a SlotReport) -> (Vec<u8>, Option<&'a [u8]>) {
         let (sender, sequence) = (self.sender, self.sequence);
         match slot_report {
             SlotReport::Empty => {
