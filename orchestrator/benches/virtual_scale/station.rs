@@ -53,3 +53,26 @@ impl<T> Station<T> {
         None
     }
 }
+
+/// Checks the mean wait of random arrivals with one server and a constant service time of 1, ρ / (2 (1 − ρ)).
+pub fn check() {
+    const LOAD: f64 = 0.7;
+    const JOBS: usize = 200_000;
+    let (mut station, mut arrival, mut ends) = (Station::new(1), 0.0, None);
+    let (mut waited, mut bits) = (0.0, 1_u64);
+    for _ in 0..JOBS {
+        bits = bits.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        arrival -= (((bits >> 11) as f64 + 0.5) / (1_u64 << 53) as f64).ln() / LOAD;
+        while let Some(end) = ends.filter(|end| *end <= arrival) {
+            ends = station.leave().map(|(job, time): (f64, f64)| {
+                waited += end - job;
+                end + time
+            });
+        }
+        if let Some((_, time)) = station.enter(arrival, 1.0) {
+            ends = Some(arrival + time);
+        }
+    }
+    let (mean, known) = (waited / JOBS as f64, LOAD / (2.0 * (1.0 - LOAD)));
+    assert!((mean / known - 1.0).abs() < 0.05, "mean wait {mean}, expected {known}");
+}
