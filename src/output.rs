@@ -149,6 +149,22 @@ impl TextTable {
                 .any(|row| row.get(column).is_none_or(|cell| !cell.is_empty() && cell != "–"))
         };
         let kept: Vec<bool> = (0..self.columns.len()).map(is_known).collect();
+        self.keep(&kept);
+    }
+
+    /// Removes columns with these titles, in this order, until all rows fit into `width` characters.
+    pub fn drop_until_it_fits(&mut self, titles: &[&str], width: usize) {
+        for title in titles {
+            let all = self.columns.iter().map(|(width, _)| width + 2).sum::<usize>();
+            if all <= width + 2 {
+                return;
+            }
+            let kept: Vec<bool> = self.rows[0].iter().map(|cell| cell != title).collect();
+            self.keep(&kept);
+        }
+    }
+
+    fn keep(&mut self, kept: &[bool]) {
         let mut place = kept.iter();
         self.columns.retain(|_| place.next() == Some(&true));
         for row in &mut self.rows {

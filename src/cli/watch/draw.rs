@@ -32,6 +32,8 @@ const MIN_HEIGHT_FOR_CHARTS: u16 = 20;
 /// Minimum height for more than the focused pane.
 const MIN_HEIGHT_FOR_PANES: u16 = 14;
 
+/// Columns that give way where a pane is too narrow for all, first to last.
+const LEAST_NEEDED: [&str; 3] = ["steps/s", "V/V₀", "T (K)"];
 /// Width of a title with the following blank in the output of commands.
 const TITLE: usize = 13;
 /// Minimum width between two numbers below a histogram.
@@ -186,6 +188,7 @@ fn draw_pane(frame: &mut Frame<'_>, area: Rect, state: &mut WatchState, index: u
     let (visible, selected) = (pane.visible(rows.height.into()), pane.index());
     let mut table = TextTable::new(titles);
     pane.entries[visible.clone()].iter().for_each(|entry| table.push(entry.columns.clone()));
+    table.drop_until_it_fits(&LEAST_NEEDED, width);
     let mut text = Vec::new();
     // Writing to memory cannot fail.
     let _ = table.write(&mut text);

@@ -150,6 +150,10 @@ fn terminals_of_every_size_are_supported() {
     }
     let text = screen(&mut state(), 200, 40);
     assert!(text.lines().any(|line| line.contains("1 walks") && line.contains("2 queue")), "{text}");
+    // Columns are whole, or left out.
+    let narrow = screen(&mut state(), 150, 40);
+    assert!(narrow.contains("γ₀_max") && !narrow.contains("steps/s"), "{narrow}");
+    assert!(!narrow.lines().any(|line| line.contains("γ₀_max") && line.contains('…')), "{narrow}");
     let flat = screen(&mut state(), 60, 12);
     assert!(flat.contains("1 walks") && !flat.contains("queue:"), "{flat}");
 }
