@@ -259,7 +259,7 @@ impl World {
                 agent.conversations.insert(number, Conversation::Slot(exchange));
                 return self.after(RETRY_DELAY, Event::Agent(key, AgentEventKind::Sends(number)));
             }
-            Ok(SlotStep::Done(Some(work))) => ExchangeEnd::Work(Box::new(work)),
+            Ok(SlotStep::Done(Some(work))) => ExchangeEnd::Work(work),
             Ok(SlotStep::Done(None)) => ExchangeEnd::Closed,
             Err(LinkError::RejoinRequired(_)) => ExchangeEnd::RejoinRequired,
             Err(why) => return self.agent_fails(key, &why),

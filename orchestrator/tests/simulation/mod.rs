@@ -15,9 +15,11 @@ mod invariants;
 mod labeller;
 mod planted;
 mod random;
+mod reactor_shell;
 mod run;
 mod scenario;
 mod shrink;
+mod supervision;
 mod walker;
 mod world;
 

@@ -183,7 +183,7 @@ pub enum SlotStep {
     /// The next request is due.
     Continue,
     /// The next assignment; `None` if there is no more work.
-    Done(Option<WorkItem>),
+    Done(Option<Box<WorkItem>>),
 }
 
 impl SlotExchange {
@@ -221,13 +221,13 @@ impl SlotExchange {
             };
             let mixture = Arc::new(mixture);
             mixtures.push_back(Arc::clone(&mixture));
-            return Ok(SlotStep::Done(Some(WorkItem { assignment: *assignment, mixture })));
+            return Ok(SlotStep::Done(Some(Box::new(WorkItem { assignment: *assignment, mixture }))));
         }
         match self.slot.read(reply)? {
             SlotAnswer::Assignment(assignment, version) => {
                 if let Some(mixture) = mixtures.iter().find(|mixture| mixture.version() == version) {
                     let mixture = Arc::clone(mixture);
-                    return Ok(SlotStep::Done(Some(WorkItem { assignment: *assignment, mixture })));
+                    return Ok(SlotStep::Done(Some(Box::new(WorkItem { assignment: *assignment, mixture }))));
                 }
                 let base = mixtures.back().cloned();
                 self.fetch = Some((assignment, MixtureFetch::new(self.slot.session(), base, version)));
