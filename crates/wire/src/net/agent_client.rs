@@ -16,13 +16,13 @@ use zerocopy::IntoBytes;
 use super::NetError;
 use super::address::{Address, Announcement};
 use super::certificates::Tls;
-use super::delta::DeltaError;
 use super::endpoint::{self, Endpoint};
 use super::handshake;
+use super::link_error::{LinkError, decode_reply, unexpected};
 use super::message::{AGENTS, AgentInfo, AgentReply, AgentRequest, ORCHESTRATOR};
 use super::mixture_fetch::MixtureFetch;
 use super::side::ConnectionSide;
-use crate::control::{ControlError, decode, encode};
+use crate::control::encode;
 use crate::mixture::ORIGINAL;
 use crate::protocol::frame;
 
@@ -67,39 +67,6 @@ pub struct Membership {
     pub original: Arc<Mixture>,
     /// Configuration for starting walkers.
     pub setup: Vec<u8>,
-}
-
-/// Why an agent cannot work with the orchestrator.
-#[derive(Debug, thiserror::Error)]
-pub enum LinkError {
-    /// The agent was considered lost, or the orchestrator was restarted. The agent can join again and deliver its
-    /// reports.
-    #[error("{0}")]
-    RejoinRequired(String),
-    /// The orchestrator rejected a message.
-    #[error("the orchestrator rejected a message: {0}")]
-    Rejected(String),
-    /// The orchestrator does not answer.
-    #[error("no answer from the orchestrator for {minutes:.1} min")]
-    Timeout {
-        /// Time since the last answer, min.
-        minutes: f64,
-    },
-    /// An answer cannot be decoded, most likely because the versions of calmwalk differ.
-    #[error("invalid answer of the orchestrator: {0}")]
-    InvalidReply(String),
-}
-
-impl From<ControlError> for LinkError {
-    fn from(why: ControlError) -> Self {
-        Self::InvalidReply(why.to_string())
-    }
-}
-
-impl From<DeltaError> for LinkError {
-    fn from(why: DeltaError) -> Self {
-        Self::InvalidReply(why.to_string())
-    }
 }
 
 impl EndpointConnection {
@@ -277,19 +244,6 @@ pub(super) async fn delay_retry(sent_at: Instant) {
     if sent_at.elapsed() < RETRY_DELAY {
         sleep(RETRY_DELAY).await;
     }
-}
-
-/// Decodes an answer; rejections are errors.
-pub(super) fn decode_reply(answer: &[u8]) -> Result<AgentReply<'_>, LinkError> {
-    match decode(answer)? {
-        AgentReply::RejoinRequired(why) => Err(LinkError::RejoinRequired(why)),
-        AgentReply::Rejected(why) => Err(LinkError::Rejected(why)),
-        reply => Ok(reply),
-    }
-}
-
-pub(super) fn unexpected(to: &str) -> LinkError {
-    LinkError::InvalidReply(format!("it does not match the request ({to})"))
 }
 
 impl Membership {

@@ -10,7 +10,7 @@ use calm::Mixture;
 use tokio_util::sync::CancellationToken;
 use zerocopy::IntoBytes;
 
-use super::agent_client::{decode_reply, unexpected};
+use super::link_error::{decode_reply, unexpected};
 use super::message::{AgentReply, AgentRequest};
 use super::mixture_fetch::MixtureFetch;
 use super::replies::AgentTransport;

@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use calm::Mixture;
 
-use super::agent_client::{LinkError, decode_reply, unexpected};
 use super::delta::DeltaReceiver;
+use super::link_error::{LinkError, decode_reply, unexpected};
 use super::message::{AgentReply, AgentRequest};
 
 /// A version of the mixture that is being fetched, part by part; a delta if the orchestrator still has the base version.

@@ -26,6 +26,7 @@ mod delta;
 mod endpoint;
 mod files;
 mod handshake;
+mod link_error;
 mod message;
 mod mixture_fetch;
 mod registry;
@@ -39,13 +40,14 @@ use std::fmt;
 use std::path::PathBuf;
 
 pub use address::{Address, Announcement};
-pub use agent_client::{AgentClient, LinkError, Membership};
+pub use agent_client::{AgentClient, Membership};
 pub use agent_event::AgentEvent;
 pub use agent_server::{AgentServer, StopTokens};
 pub use certificates::{CertificateError, CertificateFault, CheckedTls, Tls};
 pub use delta::DeltaError;
 pub use endpoint::{Endpoint, EndpointError};
 pub use handshake::HandshakeError;
+pub use link_error::LinkError;
 pub use message::{AgentId, AgentInfo};
 pub use slot::{Slot, SlotReport};
 

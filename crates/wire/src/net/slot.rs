@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use tokio::time::Instant;
 
-use super::agent_client::{LinkError, Membership, decode_reply, delay_retry};
+use super::agent_client::{Membership, delay_retry};
+use super::link_error::{LinkError, decode_reply};
 use super::message::{AgentReply, AgentRequest};
 use crate::block::CandidateBlock;
 use crate::control::{EncodedReport, checked_assignment, encode};
