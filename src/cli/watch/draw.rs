@@ -33,7 +33,7 @@ const MIN_HEIGHT_FOR_CHARTS: u16 = 20;
 const MIN_HEIGHT_FOR_PANES: u16 = 14;
 
 /// Columns that give way where a pane is too narrow for all, first to last.
-const LEAST_NEEDED: [&str; 3] = ["steps/s", "V/V₀", "T (K)"];
+const LEAST_NEEDED: [&str; 4] = ["steps/s", "V/V₀", "T (K)", "taken"];
 /// Width of a title with the following blank in the output of commands.
 const TITLE: usize = 13;
 /// Minimum width between two numbers below a histogram.
