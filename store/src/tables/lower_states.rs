@@ -120,10 +120,7 @@ impl Store {
         remark: Option<&str>,
         now: i64,
     ) -> Result<Vec<LowerStateChange>> {
-        let named = match ids {
-            Some(ids) => self.named_structures(ids).await?,
-            None => self.with_lower_states().await?,
-        };
+        let named = self.named_or_with_lower_states(ids).await?;
         let mut transaction = self.database.begin().await?;
         let now = transaction.time(now).await?;
         structures::lock(&mut transaction, named.iter().map(|named| named.structure)).await?;
@@ -147,10 +144,7 @@ impl Store {
     /// # Errors
     /// As for that.
     pub async fn lower_state_changes(&self, ids: Option<&[String]>) -> Result<Vec<LowerStateChange>> {
-        let named = match ids {
-            Some(ids) => self.named_structures(ids).await?,
-            None => self.with_lower_states().await?,
-        };
+        let named = self.named_or_with_lower_states(ids).await?;
         let mut transaction = self.database.begin_read().await?;
         let mut changes = Vec::new();
         for NamedStructure { structure, id } in named {
@@ -164,6 +158,14 @@ impl Store {
             changes.push(LowerStateChange { id, taken });
         }
         Ok(changes)
+    }
+
+    /// The named structures, or without names those with a lower state.
+    async fn named_or_with_lower_states(&self, ids: Option<&[String]>) -> Result<Vec<NamedStructure>> {
+        match ids {
+            Some(ids) => self.named_structures(ids).await,
+            None => self.with_lower_states().await,
+        }
     }
 
     async fn with_lower_states(&self) -> Result<Vec<NamedStructure>> {

@@ -16,7 +16,7 @@ pub(super) struct AgentRegistry {
     timeout: Duration,
     next_slot: u32,
     agents: BTreeMap<AgentId, RegisteredAgent>,
-    /// Agents whose heartbeat disappeared and is not back, with the time. Their requests may still be in the queue.
+    /// When the heartbeats that are missing disappeared. An agent's request to join may be handled after its death.
     silent: BTreeMap<AgentId, Instant>,
 }
 
@@ -25,8 +25,6 @@ pub(super) struct AgentRegistry {
 pub(super) struct RegisteredAgent {
     pub agent: AgentInfo,
     pub first_slot: u32,
-    /// Time at which its heartbeat disappeared.
-    silent_since: Option<Instant>,
 }
 
 impl RegisteredAgent {
@@ -46,11 +44,8 @@ impl AgentRegistry {
     pub(super) fn join(&mut self, agent: AgentInfo) -> Option<&RegisteredAgent> {
         let first_slot = self.next_slot;
         self.next_slot = first_slot.checked_add(agent.slots())?;
-        let id = agent.id.clone();
-        // An agent that has died since it sent its request must be lost like any other.
-        let silent_since = self.silent.get(&id).copied();
-        let registered = RegisteredAgent { agent, first_slot, silent_since };
-        Some(self.agents.entry(id).insert_entry(registered).into_mut())
+        let entry = self.agents.entry(agent.id.clone());
+        Some(entry.insert_entry(RegisteredAgent { agent, first_slot }).into_mut())
     }
 
     /// Removes an agent.
@@ -60,16 +55,14 @@ impl AgentRegistry {
 
     /// Updates whether the agent's heartbeat is present. Returns the agent if this changed.
     pub(super) fn set_alive(&mut self, id: &str, alive: bool, now: Instant) -> Option<&AgentInfo> {
-        match alive {
-            true => drop(self.silent.remove(id)),
-            false => drop(self.silent.entry(id.to_owned()).or_insert(now)),
-        }
-        let registered = self.agents.get_mut(id)?;
-        if alive == registered.silent_since.is_none() {
+        if alive != self.silent.contains_key(id) {
             return None;
         }
-        registered.silent_since = (!alive).then_some(now);
-        Some(&registered.agent)
+        match alive {
+            true => self.silent.remove(id),
+            false => self.silent.insert(id.to_owned(), now),
+        };
+        self.agents.get(id).map(|registered| &registered.agent)
     }
 
     pub(super) fn is_empty(&self) -> bool {
@@ -78,18 +71,18 @@ impl AgentRegistry {
 
     /// Removes the agents whose heartbeat has been missing for too long.
     pub(super) fn expire(&mut self, now: Instant) -> Vec<RegisteredAgent> {
-        let timeout = self.timeout;
-        let dead = |registered: &RegisteredAgent| {
-            registered.silent_since.is_some_and(|since| now.duration_since(since) >= timeout)
-        };
-        let dead: Vec<_> = { self.agents.extract_if(.., |_, registered| dead(registered)) }
-            .map(|(_, registered)| registered)
-            .collect();
-        // One that lives and joins again has the whole time again.
-        for registered in &dead {
-            self.silent.insert(registered.agent.id.clone(), now);
+        let Self { timeout, agents, silent, .. } = self;
+        let mut lost = Vec::new();
+        for (id, since) in silent {
+            if now.duration_since(*since) >= *timeout
+                && let Some(registered) = agents.remove(id)
+            {
+                // If it lives and joins again, it has the whole time again.
+                *since = now;
+                lost.push(registered);
+            }
         }
-        dead
+        lost
     }
 }
 
