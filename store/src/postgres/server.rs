@@ -111,7 +111,7 @@ impl PostgresServer {
     async fn begin_with(&self, statement: &'static str) -> Result<Transaction<'static, Postgres>> {
         let started = Instant::now();
         loop {
-            match self.explain_timeout(self.pool.begin_with(statement).await).await {
+            match self.explain_timeout(begin_uncancelled(self.pool.clone(), statement).await).await {
                 Err(StoreError::Unreachable(_)) if started.elapsed() < self.reconnect_timeout => {
                     sleep(RETRY_INTERVAL).await
                 }
@@ -189,6 +189,17 @@ impl fmt::Debug for PostgresServer {
 }
 
 /// A connection pool whose connections create these views first, if there are any.
+/// Begins a transaction in a task of its own. sqlx 0.9 does not roll back a transaction whose `BEGIN` was sent and whose caller was then
+/// cancelled: the connection would return to the pool inside it, and writes there would fail, or reads see an old snapshot.
+async fn begin_uncancelled(
+    pool: PgPool,
+    statement: &'static str,
+) -> sqlx::Result<Transaction<'static, Postgres>> {
+    let begun = tokio::spawn(async move { pool.begin_with(statement).await }).await;
+    // The runtime cancels the task when it shuts down.
+    begun.unwrap_or_else(|error| Err(sqlx::Error::Io(io::Error::other(error))))
+}
+
 fn pool(options: PgConnectOptions, views: Option<Arc<str>>) -> PgPool {
     let pool = PgPoolOptions::new()
         .max_connections(MAX_CONNECTIONS)

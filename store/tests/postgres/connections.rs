@@ -1,5 +1,8 @@
-//! Error messages for missing connections.
+//! Error messages for missing connections, and reads that are cancelled.
 
+use std::future::poll_fn;
+use std::pin::pin;
+use std::task::Poll;
 use std::time::Duration;
 
 use sqlx::postgres::PgConnectOptions;
@@ -55,4 +58,27 @@ async fn waiting_for_a_lock_is_not_reported_as_an_unreachable_server() {
         commit.await.unwrap().unwrap();
     }
     store.add_running_time(1).await.unwrap();
+}
+
+/// Polls a future this many times, lets others go on in between, and drops it.
+async fn cancelled_after<F: Future>(polls: usize, future: F) {
+    let mut future = pin!(future);
+    for _ in 0..polls {
+        if poll_fn(|context| Poll::Ready(future.as_mut().poll(context).is_ready())).await {
+            return;
+        }
+        tokio::task::yield_now().await;
+    }
+}
+
+/// sqlx rolls back no transaction whose beginning is cancelled: writes would fail on its connection.
+#[tokio::test]
+async fn cancelled_reads_leave_no_transaction_on_their_connection() {
+    let database = TestDatabase::new();
+    let store = database.create().await;
+    for polls in 1..60 {
+        cancelled_after(polls, store.status()).await;
+        let written = store.add_running_time(1).await;
+        written.unwrap_or_else(|error| panic!("after a read that was polled {polls} times: {error}"));
+    }
 }
