@@ -1,6 +1,6 @@
-//! Every file of `configs/` but `silicon-dft.toml` runs here, and its results can be read. The demos of aluminium and silicon run as they
-//! stand, the largest demo with shorter walks, those for foundation models with a small model, three seed structures and short walks.
-//! `CALMWALK_WHOLE_DEMOS=1 cargo test --test integration configs::` runs the largest demo as it stands instead.
+//! Every file of `configs/` but `silicon-dft.toml` runs here, and its results can be read. The demos run with shorter walks and trainings,
+//! those for foundation models with a small model and three seed structures. `CALMWALK_WHOLE_DEMOS=1 cargo test --test integration
+//! configs::` runs the demos as they stand.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -14,21 +14,28 @@ use serde_json::Value;
 
 use crate::common::{config, demo, deviation, refuse, stderr, succeed, write_frames};
 
-/// Writes a demo with walks of 800 instead of 2000 biased steps, over which the whole volume ramp runs, and with this key of the
-/// equilibration replaced. With `CALMWALK_WHOLE_DEMOS` the demo stays as it is. Returns the path of the configuration.
-fn shorter(directory: &Path, name: &str, equilibration: [&str; 2]) -> PathBuf {
-    if std::env::var_os("CALMWALK_WHOLE_DEMOS").is_some() {
+/// Writes a demo with these lines replaced: each is given by its begin, and by what that becomes. With `CALMWALK_WHOLE_DEMOS` the demo
+/// stays as it is. Returns the path of the configuration.
+fn shorter(directory: &Path, name: &str, changes: &[[&str; 2]]) -> PathBuf {
+    if runs_whole_demos() {
         return config(name);
     }
-    let mut text = demo(name);
-    for [before, after] in [["biased_steps = 2000", "biased_steps = 800"], equilibration] {
-        let [before, after] = [before, after].map(|key| format!("\n{key} "));
-        assert!(text.contains(&before), "{name} has no {before}");
-        text = text.replacen(&before, &after, 1);
-    }
     let path = directory.join(name);
-    fs::write(&path, text).unwrap();
+    fs::write(&path, changed(name, changes)).unwrap();
     path
+}
+
+fn runs_whole_demos() -> bool {
+    std::env::var_os("CALMWALK_WHOLE_DEMOS").is_some()
+}
+
+/// The text of a demo with these lines replaced.
+fn changed(name: &str, changes: &[[&str; 2]]) -> String {
+    changes.iter().fold(demo(name), |text, [before, after]| {
+        let [before, after] = [before, after].map(|begin| format!("\n{begin}"));
+        assert!(text.contains(&before), "{name} has no line {before}");
+        text.replacen(&before, &after, 1)
+    })
 }
 
 /// Runs a demo with this number of biased walks to its end, and checks its results. Returns its labelled frames, including
@@ -134,16 +141,22 @@ fn read_by_ase(path: &Path, frames: &[Frame]) {
 }
 
 #[test]
-fn aluminium_runs_as_it_stands() {
+fn aluminium_runs() {
     let directory = tempfile::tempdir().unwrap();
-    let frames = campaign(directory.path(), &config("aluminium.toml"), 24, 1.2);
+    let changes = [
+        ["biased_steps = 2000 ", "biased_steps = 800 "],
+        ["method = { native = { epochs = 10,", "method = { native = { epochs = 4,"],
+    ];
+    let file = shorter(directory.path(), "aluminium.toml", &changes);
+    let frames = campaign(directory.path(), &file, 24, 1.2);
     let mut potential = Eam::load_as(config("data/Al_mm.eam.fs"), EamStyle::FinnisSinclair).unwrap();
     check_labels(&frames, &mut potential);
-    check_loop(directory.path());
+    check_loop(directory.path(), &file);
 }
 
-/// The errors of the forces on the hot crystal and the liquid fall with each version, and the summary shows those on all data sets.
-fn check_loop(directory: &Path) {
+/// Each version has smaller errors of the forces on the hot crystal and the liquid than the first model, in the whole demo also than the
+/// version before. The summary shows the errors on all data sets.
+fn check_loop(directory: &Path, file: &Path) {
     let here = directory.join("campaign").display().to_string();
     let figures = |number: u32| -> Value {
         let shown = succeed(directory, ["versions", &here, "show", &number.to_string(), "--json"]);
@@ -159,28 +172,31 @@ fn check_loop(directory: &Path) {
         };
         let mut errors = vec![error(&sets[0], "first")];
         errors.extend(sets.iter().map(|sets| error(sets, "version")));
-        assert!(errors.windows(2).all(|pair| pair[1] < pair[0]), "{name}: {errors:?}");
+        assert!(errors[1..].iter().all(|of_version| *of_version < errors[0]), "{name}: {errors:?}");
+        let fall = errors.windows(2).all(|pair| pair[1] < pair[0]);
+        assert!(fall || !runs_whole_demos(), "{name}: {errors:?}");
     }
-    let summary =
-        succeed(directory, ["run", &config("aluminium.toml").display().to_string(), "--directory", &here]);
+    let summary = succeed(directory, ["run", &file.display().to_string(), "--directory", &here]);
     assert!(names.iter().all(|name| summary.contains(name)), "{names:?}\n{summary}");
 }
 
 #[test]
-fn silicon_runs_as_it_stands() {
+fn silicon_runs() {
     let directory = tempfile::tempdir().unwrap();
-    let frames = campaign(directory.path(), &config("silicon.toml"), 8, 1.2);
+    let changes = [["biased_steps = 2000 ", "biased_steps = 800 "]];
+    let file = shorter(directory.path(), "silicon.toml", &changes);
+    let frames = campaign(directory.path(), &file, 8, 1.2);
     check_labels(&frames, &mut StillingerWeber::load(config("data/Si.sw")).unwrap());
 }
 
 #[test]
 fn nickel_aluminium_hydrogen_runs() {
     let directory = tempfile::tempdir().unwrap();
-    let file = shorter(
-        directory.path(),
-        "nickel-aluminium-hydrogen.toml",
-        ["equilibration_steps = 200", "equilibration_steps = 80"],
-    );
+    let changes = [
+        ["biased_steps = 2000 ", "biased_steps = 400 "],
+        ["equilibration_steps = 200 ", "equilibration_steps = 40 "],
+    ];
+    let file = shorter(directory.path(), "nickel-aluminium-hydrogen.toml", &changes);
     // Three temperatures for 8 seed structures, and two more for the 7 with hydrogen. The configuration limits the distance
     // of two hydrogen atoms.
     let frames = campaign(directory.path(), &file, 38, 0.6);
@@ -262,26 +278,21 @@ fn foundation_campaign(name: &str, walks: usize) -> String {
     text
 }
 
-/// With walks of 300 instead of 100,000 biased steps.
+/// With walks of 150 instead of 100,000 biased steps.
 fn driven_walks(name: &str, version_of_each: bool) {
     let directory = tempfile::tempdir().unwrap();
-    let mut text = demo(name);
-    for [key, whole, short] in [
-        ["biased_steps", "100000", "300"],
-        ["reference_steps", "5000", "60"],
-        ["equilibration_steps", "500", "40"],
-    ] {
-        let before = format!("\n{key} = {whole}\n");
-        assert!(text.contains(&before), "{before}");
-        text = text.replacen(&before, &format!("\n{key} = {short}\n"), 1);
-    }
-    fs::write(directory.path().join("c.toml"), text).unwrap();
+    let changes = [
+        ["biased_steps = 100000\n", "biased_steps = 150\n"],
+        ["reference_steps = 5000\n", "reference_steps = 40\n"],
+        ["equilibration_steps = 500\n", "equilibration_steps = 30\n"],
+    ];
+    fs::write(directory.path().join("c.toml"), changed(name, &changes)).unwrap();
     succeed(directory.path(), ["run", "c.toml", "--directory", "here"]);
     let status: Value =
         serde_json::from_str(&succeed(directory.path(), ["status", "here", "--json"])).unwrap();
     let walks = status["walks"].as_array().unwrap();
     let volumes: Vec<_> = walks.iter().map(|walk| walk["relative_volume"].as_f64().unwrap()).collect();
-    assert!(walks.iter().all(|walk| walk["state"] == "completed" && walk["step"] == 340), "{status}");
+    assert!(walks.iter().all(|walk| walk["state"] == "completed" && walk["step"] == 180), "{status}");
     assert!(volumes.iter().all(|volume| (0.75..=1.3).contains(volume)), "{volumes:?}");
     let starts: Vec<_> =
         walks.iter().map(|walk| walk["conditions"]["constant_pressure"]["start_volume"].as_f64()).collect();
