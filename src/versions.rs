@@ -56,13 +56,7 @@ impl VersionOnDisk {
                 out.finish()?;
             }
         }
-        let version = PotentialVersion {
-            version: record.number,
-            parent: record.parent,
-            model: record.model_hash.clone(),
-            mixture: record.mixture_hash.clone(),
-        };
-        Ok(Self { version, model, mixture })
+        Ok(Self { version: record.into(), model, mixture })
     }
 
     /// The version that a decision of the log switches to, with its files in `directory`.

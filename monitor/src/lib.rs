@@ -3,7 +3,7 @@
 //! [`Snapshot`] is the state of a campaign; [`candidate_details`] the history of one candidate; [`candidate_errors`] its errors for a table; [`label_statistics`]
 //! the potential's errors against labels, and biased walks against their controls; [`label_cost`] what labels cost;
 //! [`mixture_status`] how far the mixture has moved; [`feature_map`] where structures lie in feature space; [`versions`] the versions of its potential, and [`improvement`] what
-//! one gained; [`refit_progress`] whether another one follows; [`end_reason`] why the campaign ended; [`walk_trace`] how
+//! one gained; [`refit_progress`] whether another one follows, [`refit_schedule`] when, and [`refit_record`] whether that is recorded; [`end_reason`] why the campaign ended; [`walk_trace`] how
 //! a walk went. Nothing here writes to the store, and nothing renders: values leave
 //! as numbers, or as the JSON that the documents describe.
 
@@ -29,6 +29,8 @@ pub mod mixture_values;
 pub mod provenance;
 pub mod reference_check;
 pub mod refit_progress;
+pub mod refit_record;
+pub mod refit_schedule;
 pub mod snapshot;
 #[cfg(test)]
 mod tests;

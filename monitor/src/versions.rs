@@ -12,6 +12,12 @@ use wire::ContentHash;
 /// Name of the value of the selector with the version that the decision log last switched to.
 const TAKEN_UP: &str = "version";
 
+/// Number of the version that the decision log last switched to, from the values of the selector.
+pub fn taken_up(values: &[(String, String)]) -> u32 {
+    let found = values.iter().find(|(name, _)| name == TAKEN_UP);
+    found.and_then(|(_, number)| number.parse().ok()).unwrap_or(0)
+}
+
 /// Where a version stands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
@@ -148,9 +154,7 @@ impl CampaignVersions {
             Some(protocol) => store.labels_by_walk(protocol.hash).await?,
             None => Vec::new(),
         };
-        let taken_up = values.iter().find(|(name, _)| name == TAKEN_UP);
-        let taken_up = taken_up.and_then(|(_, number)| number.parse().ok()).unwrap_or(0);
-        Ok(Self { all: summaries(&records, taken_up, &status.walks, &labels), refit })
+        Ok(Self { all: summaries(&records, taken_up(values), &status.walks, &labels), refit })
     }
 
     /// The version that drives the walks; `None` if the campaign has never trained one.

@@ -13,8 +13,7 @@ use crate::campaign::LoadedCampaign;
 use crate::config::{self, RefitSection, compare};
 use crate::output::{count, log_and_print, print, warn_if_unencrypted};
 use crate::refit::RefitOutcome;
-use crate::refit::process;
-use crate::refit::schedule::RefitSchedule;
+use crate::refit::{process, schedule};
 use crate::refit::settings::RefitterConfig;
 use crate::runtime::refit_process;
 use crate::signals::stop_token;
@@ -113,7 +112,7 @@ impl RefitArgs {
             check_is_over(store, &campaign).await?;
         }
         check_is_alone(store).await?;
-        let schedule = RefitSchedule::read(store, &campaign.config).await?;
+        let schedule = schedule::read(store, &campaign.config).await?;
         if !schedule.progress.has_news() {
             return Ok(None);
         }

@@ -33,7 +33,7 @@ use crate::forgetting::{ForgettingMeasurement, ForgettingRule};
 use crate::label_line::LabelLine;
 use crate::label_setup::LABEL_METHOD_KEY;
 use crate::output::{count, log_and_print, log_and_warn, print, warn_if_unencrypted};
-use crate::refit::schedule::RefitSchedule;
+use crate::refit::schedule;
 use crate::runtime::campaign_watch;
 use crate::runtime::notify::{self, Notifier};
 use crate::runtime::reference_check::{self, ANY_CHECK};
@@ -193,8 +193,8 @@ async fn run(
     let versioned = version_loop::in_force(campaign, &store, directory).await?;
     let campaign = &versioned;
     let selector = version_loop::restore_selector(campaign, &store).await?;
-    let schedule = RefitSchedule::read(&store, &campaign.config).await?;
-    if let Some(why) = schedule.why_no_walk_starts().filter(|_| selector.is_done()) {
+    let schedule = schedule::read(&store, &campaign.config).await?;
+    if let Some(why) = schedule::why_no_walk_starts(&schedule).filter(|_| selector.is_done()) {
         log_and_print(why);
     }
     let pauses = campaign.config.calm.on_forgetting == OnForgetting::Pause;

@@ -22,6 +22,7 @@ use std::path::{Path, PathBuf};
 
 use atoms::extxyz::write_frame;
 use monitor::refit_progress::{LABEL_SET, NO_LABELS};
+use monitor::refit_record::recorded_before;
 use potentials::grace::{GraceModel, Threads};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -109,10 +110,10 @@ async fn run(
     check_files(config)?;
     let _lock = lock(&config.directory)?;
     let versions = store.versions().await?;
-    if let Some(ended) = recorded_before(config, store, &versions).await? {
+    if let Some(ended) = ended_before(config, store, &versions).await? {
         return Ok(ended);
     }
-    let number = 1 + versions.last().map_or(0, |version| version.number);
+    let number = VersionRecord::next_number(&versions);
     let protocol = store.protocol_in_force().await?.map_or_else(String::new, |found| found.hash.to_string());
     let directory = prepare_directory(&config.directory, number, &protocol)?;
     remove_stale_errors(&directory, &config.settings)?;
@@ -167,38 +168,22 @@ fn lock(campaign: &Path) -> Result<File, CommandError> {
 }
 
 /// How this refit ended, if an earlier process of it recorded that and was killed then.
-///
-/// A registered version that is newer than the parent was made since this refit was configured. The parent of a refused one remains;
-/// its directory is left, nothing was accepted since, and the labels are the same.
-async fn recorded_before(
+async fn ended_before(
     config: &RefitterConfig,
     store: &Store,
     versions: &[VersionRecord],
 ) -> Result<Option<RefitOutcome>, CommandError> {
-    let Some(last) = versions.last() else { return Ok(None) };
-    let directory = config.directory.join(FOLDER).join(last.number.to_string());
-    let ended = if last.state == VersionState::Registered {
-        (last.number > config.parent_version).then(|| RefitOutcome::Registered(last.clone()))
-    } else if directory.exists() && !has_news_since(config, store, last).await? {
-        Some(RefitOutcome::Refused(last.clone()))
-    } else {
-        None
+    let directory = |number: u32| config.directory.join(FOLDER).join(number.to_string());
+    let is_left = |number| directory(number).exists();
+    let of_labels = (store, &config.label_split());
+    let Some(record) = recorded_before(of_labels, versions, config.parent_version, is_left).await? else {
+        return Ok(None);
     };
-    if ended.is_some() {
-        let _ = fs::remove_dir_all(&directory);
-    }
-    Ok(ended)
-}
-
-/// Whether structures were accepted, or labels changed, since an attempt.
-async fn has_news_since(
-    config: &RefitterConfig,
-    store: &Store,
-    attempt: &VersionRecord,
-) -> Result<bool, CommandError> {
-    let (set, _) = config.label_split().label_set(store).await?.unwrap_or_default();
-    let before = attempt.figures[LABEL_SET].as_str();
-    Ok(store.accepted_structures().await? != attempt.structures || before.is_some_and(|before| before != set))
+    let _ = fs::remove_dir_all(directory(record.number));
+    Ok(Some(match record.state {
+        VersionState::Registered => RefitOutcome::Registered(record),
+        VersionState::Refused => RefitOutcome::Refused(record),
+    }))
 }
 
 /// Fails if a file has another content than when the campaign began, or this refit.

@@ -3,9 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use monitor::refit_schedule::BesideWalks;
 use orchestrator::launcher::{ChildEvent, Children, Launch};
 use orchestrator::selector::CampaignMode;
-use orchestrator::supervisor::{ChildState, ExitReason, Limits};
+use orchestrator::supervisor::{ChildState, Limits};
 use store::{ProcessRecord, Store, StoreError, VersionRecord, VersionState, unix_milliseconds};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
@@ -17,8 +18,7 @@ use crate::exit_status::CommandError;
 use crate::log;
 use crate::output::{log_and_print, log_and_warn};
 use crate::process_config;
-use crate::refit;
-use crate::refit::schedule::RefitSchedule;
+use crate::refit::{self, schedule};
 use crate::refit::settings::RefitterConfig;
 
 /// Interval between checks for a due refit and for newer versions of a live campaign.
@@ -150,7 +150,7 @@ impl<'a> RefitProcess<'a> {
     /// Records that no version comes of a refit that crashes again and again.
     async fn refuse(&self, why: &CommandError) -> Result<(), CommandError> {
         let RunContext { store, campaign, .. } = self.run;
-        let number = 1 + store.versions().await?.last().map_or(0, |version| version.number);
+        let number = VersionRecord::next_number(&store.versions().await?);
         let record = VersionRecord {
             number,
             parent: campaign.version_number(),
@@ -173,24 +173,27 @@ impl<'a> RefitProcess<'a> {
 
     async fn check(&mut self) -> Result<(), CommandError> {
         let RunContext { store, campaign, superseded, walks_end, .. } = self.run;
-        let schedule = RefitSchedule::read(store, &campaign.config).await?;
-        let is_newer = |version: Option<&VersionRecord>| {
-            version.is_some_and(|version| version.number > campaign.version_number())
-        };
-        if is_newer(schedule.in_force()) {
-            if !superseded.is_cancelled() {
-                log_and_print("a newer version of the potential is registered: the walks with this one end");
+        let schedule = schedule::read(store, &campaign.config).await?;
+        let begin = campaign_begin(store).await?;
+        match schedule.beside_walks(campaign.version_number(), begin, unix_milliseconds()) {
+            BesideWalks::Superseded => {
+                if !superseded.is_cancelled() {
+                    log_and_print("a newer version of the potential is registered: the walks with this one end");
+                }
+                superseded.cancel();
             }
-            superseded.cancel();
-        } else if is_newer(schedule.newest()) {
-            walks_end.cancel();
-        } else if self.children.is_none()
-            && self.wait_until.is_none_or(|time| Instant::now() >= time)
-            && schedule.is_due_beside_walks(self.refit, campaign_begin(store).await?, unix_milliseconds())
-            && !is_another_running(store).await?
-            && let Err(why) = self.start()
-        {
-            self.try_again_later(&why);
+            BesideWalks::WalksEnd => walks_end.cancel(),
+            BesideWalks::RefitDue => {
+                let may_start =
+                    self.children.is_none() && self.wait_until.is_none_or(|time| Instant::now() >= time);
+                if may_start
+                    && !is_another_running(store).await?
+                    && let Err(why) = self.start()
+                {
+                    self.try_again_later(&why);
+                }
+            }
+            BesideWalks::GoOn => {}
         }
         Ok(())
     }
@@ -231,11 +234,7 @@ fn how_it_failed(children: &mut Children) -> Option<RefitEnd> {
     let how = all_failed_message(children)?;
     let error = CommandError::Failed(format!("the refit failed: {how}; the same command continues it"));
     let last = children.status().into_iter().next_back().and_then(|child| child.last_failure);
-    let is_reported = last.is_some_and(|reason| match reason {
-        ExitReason::StartFailed { .. } => true,
-        reason => matches!(reason, ExitReason::Exit { .. }) && !reason.is_crash(),
-    });
-    Some(if is_reported { RefitEnd::CannotGoOn(error) } else { RefitEnd::Crashed(error) })
+    Some(if last.is_some_and(|reason| reason.is_reported()) { RefitEnd::CannotGoOn(error) } else { RefitEnd::Crashed(error) })
 }
 
 /// When the campaign began, ms since 1970.

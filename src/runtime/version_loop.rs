@@ -5,8 +5,9 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use monitor::refit_schedule::AfterWalks;
 use orchestrator::reactor::RunOutcome;
-use orchestrator::selector::{CampaignMode, Selector, SelectorSettings, SelectorSnapshot};
+use orchestrator::selector::{Selector, SelectorSettings, SelectorSnapshot};
 use store::{Store, WalkRecord, unix_milliseconds};
 use tokio_util::sync::CancellationToken;
 use workers::walk::has_known_layout;
@@ -18,7 +19,7 @@ use crate::campaign::LoadedCampaign;
 use crate::config::RefitSection;
 use crate::exit_status::CommandError;
 use crate::output::{count, log_and_print};
-use crate::refit::schedule::RefitSchedule;
+use crate::refit::schedule;
 use crate::signals::cancel_on_signal;
 use crate::versions::VersionOnDisk;
 
@@ -52,7 +53,7 @@ pub async fn run(
 /// Whether a campaign whose walks have all ended has labels to wait for, or a version to train. Walks that made room for a version
 /// did not wait for theirs.
 async fn is_anything_left(campaign: &LoadedCampaign, store: &Store) -> Result<bool, CommandError> {
-    let schedule = RefitSchedule::read(store, &campaign.config).await?;
+    let schedule = schedule::read(store, &campaign.config).await?;
     Ok(schedule.progress.is_refit_left() || store.has_pending_labels(unix_milliseconds()).await?)
 }
 
@@ -83,19 +84,14 @@ async fn run_version(
         process.stop().await?;
         return Ok(VersionEnd::Campaign(ended));
     }
-    let schedule = RefitSchedule::read(run.store, &run.campaign.config).await?;
-    let next = schedule.in_force().map_or(0, |version| version.number);
-    let is_newer = next > run.campaign.version_number();
-    if is_newer {
-        // A version that the user went back to makes the refit beside the walks pointless.
-        process.stop().await?;
-    } else if process.is_running() || schedule.progress.is_refit_left() {
-        tokio::select! {
+    let schedule = schedule::read(run.store, &run.campaign.config).await?;
+    match schedule.after_walks(run.campaign.version_number(), process.is_running()) {
+        AfterWalks::NewerVersion => process.stop().await?,
+        AfterWalks::Refit => tokio::select! {
             ended = process.run_to_end() => ended?,
             never = write_heartbeats(run.store.clone(), run.process.clone()) => match never {},
-        }
-    } else {
-        return Ok(VersionEnd::Campaign(ended));
+        },
+        AfterWalks::End => return Ok(VersionEnd::Campaign(ended)),
     }
     if run.stop.is_cancelled() {
         return Ok(VersionEnd::Campaign(RunOutcome::Stopped));
@@ -110,7 +106,7 @@ pub async fn in_force(
     store: &Store,
     directory: &Path,
 ) -> Result<LoadedCampaign, CommandError> {
-    let schedule = RefitSchedule::read(store, &campaign.config).await?;
+    let schedule = schedule::read(store, &campaign.config).await?;
     let Some(record) = schedule.in_force().filter(|found| found.number != campaign.version_number()) else {
         return Ok(campaign.clone());
     };
@@ -166,17 +162,12 @@ fn check_layout(walks: &[WalkRecord]) -> Result<(), CommandError> {
     }
 }
 
-/// Number of accepted structures at which walks make room for a refit. Walks of a live campaign continue beside it, until its last
-/// version is there.
+/// Number of accepted structures at which walks make room for a refit.
 async fn refit_at(campaign: &LoadedCampaign, store: &Store) -> Result<Option<u32>, CommandError> {
-    let config = &campaign.config;
-    let Some(refit) = &config.refit else { return Ok(None) };
-    let schedule = RefitSchedule::read(store, config).await?;
-    if config.campaign.mode == CampaignMode::Live && !schedule.is_newest_without_walks() {
-        return Ok(None);
+    match campaign.config.refit {
+        Some(_) => Ok(schedule::read(store, &campaign.config).await?.walks_end_at()),
+        None => Ok(None),
     }
-    let number = schedule.refit_at(refit);
-    Ok(number.map(|number| number.min(u32::MAX.into()) as u32))
 }
 
 #[cfg(test)]

@@ -74,6 +74,18 @@ pub struct VersionFiles {
 impl VersionRecord {
     /// [`Self::method`] of a version that is an earlier one again.
     pub const ROLLBACK: &str = "rollback";
+
+    /// The number after all these versions and refused attempts, which are in order.
+    pub fn next_number(versions: &[Self]) -> u32 {
+        versions.last().map_or(1, |last| last.number.saturating_add(1))
+    }
+}
+
+impl VersionFiles {
+    /// The BLAKE3 hashes of model and mixture, as a [`VersionRecord`] has them.
+    pub fn hashes(&self) -> [String; 2] {
+        [&self.model, &self.mixture].map(|bytes| blake3::hash(bytes).to_string())
+    }
 }
 
 /// Which version of the potential drives each walk. Walks of a version have higher numbers than those of the versions before:

@@ -4,6 +4,7 @@ use atoms::{MinDistanceRule, Structure};
 use calm::forgetting::ForgettingAlarm;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use store::VersionRecord;
 use store::records::{ComponentRecord, WalkRecord};
 use wire::{ContentHash, WalkConditions};
 
@@ -65,6 +66,17 @@ pub struct PotentialVersion {
     pub model: String,
     /// The same of the mixture's file.
     pub mixture: String,
+}
+
+impl From<&VersionRecord> for PotentialVersion {
+    fn from(record: &VersionRecord) -> Self {
+        Self {
+            version: record.number,
+            parent: record.parent,
+            model: record.model_hash.clone(),
+            mixture: record.mixture_hash.clone(),
+        }
+    }
 }
 
 /// The settings of the selector.

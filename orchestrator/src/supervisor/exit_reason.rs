@@ -63,6 +63,15 @@ impl ExitReason {
         }
     }
 
+    /// Whether it is known what the process cannot go on without: it said so, or the system did when it was started.
+    pub fn is_reported(&self) -> bool {
+        match self {
+            Self::StartFailed { .. } => true,
+            Self::Exit { .. } => !self.is_crash(),
+            Self::Signal { .. } | Self::Unresponsive(_) | Self::StopTimeout(_) | Self::Unknown => false,
+        }
+    }
+
     /// Whether this is the expected result of SIGTERM.
     pub(super) fn is_expected_after_stop(&self) -> bool {
         match self {
@@ -153,6 +162,9 @@ mod tests {
         assert!(!ExitReason::Unresponsive(Duration::from_secs(1)).is_crash());
         let not_started = ExitReason::StartFailed { reason: "no memory".to_owned(), is_shortage: true };
         assert!(!not_started.is_crash() && !ExitReason::Unknown.is_crash());
+        let exit = |code| ExitReason::Exit { code, last_line: None };
+        assert!(not_started.is_reported() && exit(1).is_reported());
+        assert!(!exit(PANIC).is_reported() && !signal(9).is_reported() && !ExitReason::Unknown.is_reported());
     }
 
     #[test]

@@ -8,7 +8,7 @@ mod list;
 mod roll_back;
 mod show;
 
-use orchestrator::selector::VERSION;
+use monitor::versions::taken_up;
 use store::{Location, Store, VersionRecord, VersionState};
 
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
@@ -74,10 +74,7 @@ struct KnownVersions {
 
 impl KnownVersions {
     async fn read(store: &Store) -> Result<Self, CommandError> {
-        let values = store.values().await?;
-        let taken_up = values.iter().find(|(name, _)| name == VERSION);
-        let taken_up = taken_up.and_then(|(_, number)| number.parse().ok()).unwrap_or(0);
-        Ok(Self { versions: store.versions().await?, taken_up })
+        Ok(Self { versions: store.versions().await?, taken_up: taken_up(&store.values().await?) })
     }
 
     /// The newest registered version; `None` for that of the configuration.

@@ -126,8 +126,9 @@ impl VersionsRollBackArgs {
             return Ok(None);
         };
         let files = VersionFiles { model: read(&files.model.path)?, mixture };
+        let [model_hash, mixture_hash] = files.hashes();
         let record = VersionRecord {
-            number: versions.last().map_or(1, |last| last.number.saturating_add(1)),
+            number: VersionRecord::next_number(versions),
             parent: number,
             state: VersionState::Registered,
             reason: String::new(),
@@ -136,8 +137,8 @@ impl VersionsRollBackArgs {
             structures: versions.iter().map(|version| version.structures).max().unwrap_or(0),
             last_decision,
             labels: source.map_or(0, |source| source.labels),
-            model_hash: blake3::hash(&files.model).to_string(),
-            mixture_hash: blake3::hash(&files.mixture).to_string(),
+            model_hash,
+            mixture_hash,
             figures: figures_of_same_model(versions, number),
             seconds: begun.elapsed().as_secs_f64(),
             core_hours: 0.0,
