@@ -330,7 +330,8 @@ impl World {
         };
         let is_script = |number: &usize| seed_structure(*number).structure == assignment.seed_structure;
         let script = (0..SEED_STRUCTURES).find(is_script).expect("one of the scenario");
-        let report = advance(&self.scenario.scripts[script], assignment, mixture, None);
+        let events = self.scenario.script(script, assignment.conditions.version);
+        let report = advance(&events, assignment, mixture, None);
         self.tell(format!(
             "walker {walker} of agent {} reports on walk {}, assignment {}",
             key.agent, report.walk, report.assignment

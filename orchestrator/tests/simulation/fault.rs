@@ -116,6 +116,14 @@ pub enum Fault {
         walker: u32,
         crash: bool,
     },
+    /// The refitter that runs, or the next one, is killed after this time, and so many processes of it.
+    KillRefitter {
+        after: Time,
+        times: u32,
+        crash: bool,
+    },
+    /// A person goes back to an earlier version of the potential.
+    RollBack,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -140,6 +148,7 @@ pub enum LinkTrouble {
 pub enum ClientKind {
     Orchestrator,
     Labeller,
+    Refitter,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -168,6 +177,24 @@ impl Fault {
             8 => Self::MuteAgent { agent, until },
             _ => Self::KillAgentWalker { agent, walker: random.below(2) as u32, crash: random.happens(20) },
         }
+    }
+
+    /// A fault of refits.
+    fn draw_of_refits(random: &mut Random, scenario: &Scenario, _: Time) -> Self {
+        match random.below(10) {
+            0..4 => {
+                let moment = [Moment::BeforeCommit, Moment::AfterCommit][random.below(2) as usize];
+                Self::NextWrite { client: ClientKind::Refitter, moment }
+            }
+            4..6 => Self::KillOrchestrator,
+            6 if !scenario.is_reproducible() => Self::RollBack,
+            _ => Self::kill_refitter(random),
+        }
+    }
+
+    fn kill_refitter(random: &mut Random) -> Self {
+        let (after, times) = (random.below(15_000), random.between(1, 3) as u32);
+        Self::KillRefitter { after, times, crash: random.happens(50) }
     }
 
     fn draw(random: &mut Random, scenario: &Scenario, at: Time) -> Self {
@@ -210,6 +237,15 @@ impl Fault {
         }
     }
 
+    /// Replaces what would change the labels of a campaign.
+    fn keep_labels(&mut self, random: &mut Random) {
+        match self {
+            Self::DropJob | Self::RetryJob | Self::Relabel => *self = Self::kill_refitter(random),
+            Self::KillLabeller { crash, .. } => *crash = false,
+            _ => {}
+        }
+    }
+
     /// When it is over.
     pub fn end(&self, at: Time) -> Time {
         match self {
@@ -236,10 +272,18 @@ pub fn plan(seed: u64, scenario: &Scenario) -> Vec<PlannedFault> {
         .map(|_| {
             let at = random.below(LAST_BEGIN);
             let of_agents = scenario.agents > 0 && random.happens(60);
-            let draw = if of_agents { Fault::draw_of_agents } else { Fault::draw };
+            let of_refits = scenario.refits.is_some() && random.happens(50);
+            let draw = match (of_agents, of_refits) {
+                (true, _) => Fault::draw_of_agents,
+                (_, true) => Fault::draw_of_refits,
+                _ => Fault::draw,
+            };
             PlannedFault { at, fault: draw(&mut random, scenario, at) }
         })
         .collect();
+    if scenario.has_fixed_labels() {
+        plan.iter_mut().for_each(|planned| planned.fault.keep_labels(&mut random));
+    }
     plan.sort_by_key(|planned| planned.at);
     // A third crash in the same assignment would end its walk, and a reproducible campaign would differ.
     let mut crashes = 0;
@@ -277,6 +321,7 @@ impl fmt::Display for Fault {
                 let who = match client {
                     ClientKind::Orchestrator => "the orchestrator",
                     ClientKind::Labeller => "a labeller",
+                    ClientKind::Refitter => "a refitter",
                 };
                 match moment {
                     Moment::BeforeCommit => write!(f, "the next write of {who} will fail"),
@@ -329,6 +374,11 @@ impl fmt::Display for Fault {
             Self::KillAgentWalker { agent, walker, .. } => {
                 write!(f, "walker {walker} of agent {agent} is killed")
             }
+            Self::KillRefitter { after, times, crash } => {
+                let how = if *crash { "crashes" } else { "is killed" };
+                write!(f, "the next refitter {how} after {} s, {times} times", seconds(after))
+            }
+            Self::RollBack => f.write_str("a person goes back to an earlier version"),
         }
     }
 }

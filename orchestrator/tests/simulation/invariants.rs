@@ -46,7 +46,8 @@ const MUST_BE_NONE: [(&str, &str); 12] = [
     ),
     (
         "ends of walks stand twice",
-        "SELECT count(*) FROM (SELECT 1 FROM decision WHERE kind = 'ended' GROUP BY walk HAVING count(*) > 1)",
+        "SELECT count(*) FROM (SELECT 1 FROM decision WHERE kind IN ('ended', 'resumed') GROUP BY walk
+         HAVING sum(kind = 'ended') > 1 + sum(kind = 'resumed'))",
     ),
     (
         "accepted candidates have no job",
@@ -112,6 +113,9 @@ impl World {
         if let Some((count, (what, _))) = broken {
             return self.fail(format!("{what} ({count})"));
         }
+        if self.scenario.refits.is_some() {
+            self.check_versions();
+        }
         let numbers: Vec<i64> = numbers.split(',').filter_map(|number| number.parse().ok()).collect();
         // Walks begin only once, so the numbers have fixed places.
         let before = std::mem::replace(&mut self.known.numbers, numbers.clone());
@@ -137,7 +141,7 @@ impl World {
         }
     }
 
-    fn ask<T>(&mut self, sql: &str) -> T
+    pub(super) fn ask<T>(&mut self, sql: &str) -> T
     where
         T: for<'r> sqlx::FromRow<'r, sqlx::sqlite::SqliteRow> + Send + Unpin,
     {
@@ -165,6 +169,9 @@ impl World {
         let (walks,): (i64,) = self.ask("SELECT count(*) FROM walk WHERE state IN ('waiting', 'running')");
         let is_used_up = self.scenario.label_budget.is_some();
         self.check_budget();
+        if self.scenario.refits.is_some() {
+            self.check_refits_at_end();
+        }
         if waiting > 0 && !is_used_up || walks > 0 {
             self.fail(format!("the campaign has ended with {waiting} unfinished jobs and {walks} walks"));
         }

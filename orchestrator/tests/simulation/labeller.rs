@@ -1,5 +1,6 @@
 //! Labellers: a stand-in that follows the rules of `workers::labeller` step by step, on the real label queue.
 
+use monitor::end_reason::is_refit_due;
 use store::records::{Label, Lease};
 use store::{CalculationRecord, CompleteOutcome, LeaseStatus, ProcessRecord, StoreError};
 use wire::ContentHash;
@@ -395,7 +396,9 @@ impl World {
             let led = others.iter().any(ProcessRecord::is_leading);
             labeller.no_more_jobs = match led {
                 true => false,
-                false => self.store.read(now, async |store| store.all_walks_ended().await)?,
+                false => self.store.read(now, async |store| {
+                    Ok(store.all_walks_ended().await? && !is_refit_due(store).await?)
+                })?,
             };
             if !led {
                 self.store.write(now, ClientKind::Labeller, "leases of dead processes", async |store| {

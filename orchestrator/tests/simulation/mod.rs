@@ -16,10 +16,13 @@ mod labeller;
 mod planted;
 mod random;
 mod reactor_shell;
+mod refit;
+mod refitter;
 mod run;
 mod scenario;
 mod shrink;
 mod supervision;
+mod versions;
 mod walker;
 mod world;
 
@@ -32,7 +35,7 @@ use tempfile::TempDir;
 
 use self::fault::{PlannedFault, plan};
 use self::planted::PlantedBug;
-use self::scenario::{AGENT_SEEDS, SEED_STRUCTURES, Scenario};
+use self::scenario::{AGENT_SEEDS, REFIT_SEEDS, SEED_STRUCTURES, Scenario};
 use self::world::{Outcome, World};
 use crate::common::{CAMPAIGN, seed_structure};
 
@@ -40,6 +43,8 @@ use crate::common::{CAMPAIGN, seed_structure};
 const SEEDS: u64 = 64;
 /// The same with agents.
 const SEEDS_WITH_AGENTS: u64 = 24;
+/// The same with refits.
+const SEEDS_WITH_REFITS: u64 = 12;
 /// A planted bug must be found within this number of seeds.
 const SEEDS_TO_FIND: u64 = 1_000;
 
@@ -146,6 +151,12 @@ fn no_seed_breaks_an_invariant() {
 #[test]
 fn no_seed_with_agents_breaks_an_invariant() {
     check_seeds(AGENT_SEEDS..AGENT_SEEDS + number_in("CALMWALK_SEEDS").unwrap_or(SEEDS_WITH_AGENTS));
+}
+
+/// The same with refits of the potential.
+#[test]
+fn no_seed_with_refits_breaks_an_invariant() {
+    check_seeds(REFIT_SEEDS..REFIT_SEEDS + number_in("CALMWALK_SEEDS").unwrap_or(SEEDS_WITH_REFITS));
 }
 
 fn check_seeds(seeds: std::ops::Range<u64>) {

@@ -1,7 +1,7 @@
 //! Mistakes that are made on purpose, to see that the simulation finds them. They are made at the edges, never in the
 //! program itself.
 
-use super::scenario::AGENT_SEEDS;
+use super::scenario::{AGENT_SEEDS, REFIT_SEEDS};
 
 /// A mistake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -52,10 +52,20 @@ pub enum PlantedBug {
     LateReplyBelieved,
     /// An agent that has lost its registration starts again with the slots of the old one.
     OldSlotsKept,
+    /// After a restart the orchestrator does not know how many versions may be trained.
+    VersionLimitForgotten,
+    /// A refit does not look whether an earlier process of it has recorded its version.
+    VersionRecordedTwice,
+    /// The walks of a newer version start while those of the version before go on.
+    OldWalksContinue,
+    /// A run ends with its walks, although a refit is left.
+    RefitAbandoned,
+    /// A version that was refused is taken up.
+    RefusedVersionTakenUp,
 }
 
 impl PlantedBug {
-    pub const ALL: [Self; 23] = [
+    pub const ALL: [Self; 28] = [
         Self::AnswerBeforeCommit,
         Self::FailedCommitBelieved,
         Self::CommitRepeated,
@@ -79,6 +89,11 @@ impl PlantedBug {
         Self::AgentIdReused,
         Self::LateReplyBelieved,
         Self::OldSlotsKept,
+        Self::VersionLimitForgotten,
+        Self::VersionRecordedTwice,
+        Self::OldWalksContinue,
+        Self::RefitAbandoned,
+        Self::RefusedVersionTakenUp,
     ];
 }
 
@@ -89,6 +104,11 @@ impl PlantedBug {
             Self::AgentLossForgotten | Self::AgentIdReused | Self::LateReplyBelieved | Self::OldSlotsKept => {
                 AGENT_SEEDS
             }
+            Self::VersionLimitForgotten
+            | Self::VersionRecordedTwice
+            | Self::OldWalksContinue
+            | Self::RefitAbandoned
+            | Self::RefusedVersionTakenUp => REFIT_SEEDS,
             _ => 0,
         }
     }
@@ -116,7 +136,12 @@ impl PlantedBug {
             Self::CalculationRecordedLate => 57,
             Self::AgentLossForgotten => AGENT_SEEDS,
             Self::LateReplyBelieved | Self::OldSlotsKept => AGENT_SEEDS + 1,
-            Self::AgentIdReused => self.first_seed(),
+            Self::AgentIdReused
+            | Self::VersionLimitForgotten
+            | Self::VersionRecordedTwice
+            | Self::OldWalksContinue
+            | Self::RefitAbandoned
+            | Self::RefusedVersionTakenUp => self.first_seed(),
         }
     }
 }

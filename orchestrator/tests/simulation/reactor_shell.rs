@@ -10,6 +10,7 @@ use wire::transport::WorkItem;
 use super::fault::Direction;
 use super::faulty_store::CommitTry;
 use super::planted::PlantedBug;
+use super::refit::RunRefits;
 use super::run::TICK;
 use super::walker::WalkerKey;
 use super::world::{Event, World};
@@ -181,8 +182,10 @@ impl World {
         if !run.finished || run.stopping.is_cancelled() {
             return;
         }
+        let makes_room = run.refits.as_ref().is_some_and(RunRefits::makes_room);
         let pending = self.store.read(now, async |store| store.has_pending_labels(wall).await);
-        if pending.is_ok_and(|pending| !pending) || self.bug == Some(PlantedBug::QueueAbandoned) {
+        // Walks of a newer version do not wait for the labels of those that made room.
+        if makes_room || pending.is_ok_and(|pending| !pending) || self.bug == Some(PlantedBug::QueueAbandoned) {
             let actions = run.labellers.stop(elapsed);
             self.act_on_labellers(session, actions);
         }

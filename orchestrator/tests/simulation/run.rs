@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use calm::Mixture;
 use orchestrator::reactor::ReactorCore;
-use orchestrator::selector::SelectorSnapshot;
+use orchestrator::selector::{Selector, SelectorSnapshot};
 use orchestrator::supervisor::{Limits, Supervisor};
 use store::records::Commit;
 use store::{CampaignLock, ProcessRecord, Store, StoreError};
@@ -18,6 +18,7 @@ use wire::net::datagram::AgentDatagramServer;
 use super::agent::AGENT_TIMEOUT;
 use super::fault::{ClientKind, Time};
 use super::planted::PlantedBug;
+use super::refit::RunRefits;
 use super::scenario::SEED_STRUCTURES;
 use super::world::{Event, World};
 use crate::common::restore;
@@ -69,6 +70,8 @@ pub struct Run {
     pub(super) ticks: bool,
     /// What was read once: paused walks, length of the queue.
     pub(super) has_read: [bool; 2],
+    /// Refits, if the campaign has any.
+    pub(super) refits: Option<RunRefits>,
 }
 
 impl World {
@@ -90,45 +93,9 @@ impl World {
         self.store.generation = session;
         let record = self.process_record(ProcessRecord::ORCHESTRATOR, None, format!("run-{session}"));
         match self.open_run(&record) {
-            Ok((core, stopping)) => {
+            Ok((selector, version)) => {
                 self.tell(format!("run {session} begins"));
-                let limits = Limits { detached: true, ..LIMITS };
-                let agents = AgentDatagramServer::new(
-                    session,
-                    AGENT_TIMEOUT,
-                    Arc::clone(core.selector().mixture()),
-                    core.selector().original(),
-                    stopping.clone(),
-                );
-                let run = Run {
-                    core,
-                    agents,
-                    server: DatagramServer::new(session),
-                    walkers: Supervisor::new(self.scenario.walkers, LIMITS),
-                    labellers: Supervisor::new(
-                        self.scenario.labellers,
-                        Limits { heartbeat_timeout: Duration::from_secs(60), ..limits },
-                    ),
-                    labeller_processes: BTreeMap::new(),
-                    incarnations: BTreeMap::new(),
-                    shared_memory: BTreeMap::new(),
-                    stopping,
-                    writing: None,
-                    finished: false,
-                    record,
-                    lock,
-                    stopped_until: 0,
-                    supervises_at: None,
-                    ticks: false,
-                    has_read: [false; 2],
-                };
-                self.runs.insert(session, run);
-                self.adopt_labellers(session);
-                self.after(0, Event::RunSupervises(session));
-                if self.scenario.agents > 0 {
-                    self.after(0, Event::AgentExpiry(session));
-                }
-                self.after(HEARTBEAT_INTERVAL, Event::RunHeartbeat(session));
+                self.begin_walks(session, (record, lock), (selector, version));
             }
             Err(error) => {
                 self.tell(format!("run {session} cannot begin: {error}"));
@@ -138,11 +105,71 @@ impl World {
         }
     }
 
+    /// Starts reactor, servers and supervisors of a run, for the walks of one version of the potential.
+    pub(super) fn begin_walks(
+        &mut self,
+        session: u64,
+        (record, lock): (ProcessRecord, Option<RunLock>),
+        (selector, version): (Selector, u32),
+    ) {
+        let stopping = CancellationToken::new();
+        let limits = Limits { detached: true, ..LIMITS };
+        let agents = AgentDatagramServer::new(
+            session,
+            AGENT_TIMEOUT,
+            Arc::clone(selector.mixture()),
+            selector.original(),
+            stopping.clone(),
+        );
+        let run = Run {
+            core: ReactorCore::new(selector, stopping.clone(), self.scenario.queue_limit),
+            agents,
+            server: DatagramServer::new(session),
+            walkers: Supervisor::new(self.scenario.walkers, LIMITS),
+            labellers: Supervisor::new(
+                self.scenario.labellers,
+                Limits { heartbeat_timeout: Duration::from_secs(60), ..limits },
+            ),
+            labeller_processes: BTreeMap::new(),
+            incarnations: BTreeMap::new(),
+            shared_memory: BTreeMap::new(),
+            stopping,
+            writing: None,
+            finished: false,
+            record,
+            lock,
+            stopped_until: 0,
+            supervises_at: None,
+            ticks: false,
+            has_read: [false; 2],
+            refits: self.scenario.refits.as_ref().map(|_| RunRefits::new(version)),
+        };
+        self.runs.insert(session, run);
+        self.adopt_labellers(session);
+        self.after(0, Event::RunSupervises(session));
+        if self.scenario.agents > 0 {
+            self.after(0, Event::AgentExpiry(session));
+        }
+        self.watch_refits(session);
+        self.after(HEARTBEAT_INTERVAL, Event::RunHeartbeat(session));
+    }
+
     /// Reclaims leases, registers, restores the selector, and starts walks.
-    fn open_run(&mut self, record: &ProcessRecord) -> Result<(ReactorCore, CancellationToken), StoreError> {
+    fn open_run(&mut self, record: &ProcessRecord) -> Result<(Selector, u32), StoreError> {
         let (now, wall, client) = (self.now, self.wall_clock(), ClientKind::Orchestrator);
         self.store
             .write(now, client, "leases are reclaimed", async |store| store.reclaim_leases(wall).await)?;
+        let restored = self.restore_selector()?;
+        self.store.write(now, client, "a process is registered", async |store| {
+            store.upsert_process(record).await
+        })?;
+        Ok(restored)
+    }
+
+    /// The selector with the state in the store, and the version of the potential in force. New walks are started.
+    pub(super) fn restore_selector(&mut self) -> Result<(Selector, u32), StoreError> {
+        let (now, client) = (self.now, ClientKind::Orchestrator);
+        let settings = self.settings_in_force()?;
         let mut snapshot = self.store.read(now, snapshot).inspect(|snapshot| {
             debug_assert_eq!(snapshot.imported, 0);
         })?;
@@ -152,16 +179,12 @@ impl World {
         if self.bug == Some(PlantedBug::MixtureForgotten) {
             snapshot.components.clear();
         }
-        let mut selector = restore(&self.scenario.settings, SEED_STRUCTURES, snapshot);
+        let mut selector = restore(&settings, SEED_STRUCTURES, snapshot);
         let begun = selector.start_walks();
-        if !begun.walks.is_empty() {
+        if !begun.decisions.is_empty() {
             self.store.write(now, client, "walks begin", async |store| store.commit(&begun).await)?;
         }
-        self.store.write(now, client, "a process is registered", async |store| {
-            store.upsert_process(record).await
-        })?;
-        let stopping = CancellationToken::new();
-        Ok((ReactorCore::new(selector, stopping.clone(), self.scenario.queue_limit), stopping))
+        Ok((selector, settings.version.version))
     }
 
     /// Whether a run is there and does not hang; if it hangs, the event comes later.
@@ -224,16 +247,26 @@ impl World {
         let labellers = run.labellers.stop(elapsed);
         self.act_on_walkers(session, walkers);
         self.act_on_labellers(session, labellers);
+        self.stop_refit_after_walks(session);
         self.pump(session);
     }
 
-    /// Ends a run whose reactor and processes have ended. The campaign is over if nothing is left to do.
+    /// Ends a run whose reactor and processes have ended, unless a refit or walks with another version follow.
     pub(super) fn end_if_over(&mut self, session: u64) {
-        let (now, wall) = (self.now, self.wall_clock());
         let Some(run) = self.runs.get(&session) else { return };
         if !(run.finished && run.walkers.is_over() && run.labellers.is_over() && run.agents.has_no_agents()) {
             return;
         }
+        match run.refits.is_some() {
+            true => self.walks_have_ended(session),
+            false => self.finish_run(session, true),
+        }
+    }
+
+    /// Ends a run. The campaign is over if nothing is left to do; only a run that has finished can know that.
+    pub(super) fn finish_run(&mut self, session: u64, finished: bool) {
+        let (now, wall) = (self.now, self.wall_clock());
+        let run = &self.runs[&session];
         let id = run.record.id.clone();
         let _ = self.store.write(now, ClientKind::Orchestrator, "a process is removed", async |store| {
             store.remove_process(&id).await
@@ -244,7 +277,7 @@ impl World {
         let abandons = self.bug == Some(PlantedBug::QueueAbandoned) && !run.stopping.is_cancelled();
         self.run_ends(session, "in order");
         // The next run looks again.
-        self.over = is_over.unwrap_or(false) || abandons;
+        self.over = finished && is_over.unwrap_or(false) || abandons;
     }
 }
 

@@ -1,7 +1,10 @@
 //! What is simulated: the campaign, its walks and processes. A few scenarios alternate, so that a reproducible campaign
 //! can be compared with its undisturbed run.
 
+use monitor::refit_progress::RefitRules;
+use monitor::refit_schedule::RefitTiming;
 use orchestrator::selector::{CampaignMode, SelectorSettings};
+use serde_json::{Value, json};
 
 use super::random::Random;
 use crate::common::scripted::{Event, Script};
@@ -11,6 +14,8 @@ use crate::common::settings;
 pub const SCENARIOS: u64 = 8;
 /// Seeds from this one on have agents on other hosts.
 pub const AGENT_SEEDS: u64 = 1 << 32;
+/// Seeds from this one on have refits of the potential.
+pub const REFIT_SEEDS: u64 = 1 << 33;
 /// Number of seed structures.
 pub const SEED_STRUCTURES: usize = 3;
 
@@ -30,13 +35,46 @@ pub struct Scenario {
     pub label_budget: Option<u64>,
     /// Whether the database is a server: connections break, locks are lost, and a commit is looked up by its mark.
     pub server: bool,
+    /// How the potential is trained anew, if it is.
+    pub refits: Option<RefitPlan>,
+}
+
+/// How the potential is trained anew.
+#[derive(Clone)]
+pub struct RefitPlan {
+    /// The configuration in force, of which labellers read the rules as well.
+    pub configuration: Value,
+    pub timing: RefitTiming,
+    /// Number of processes that a refit may crash.
+    pub max_attempts: u32,
+}
+
+impl RefitPlan {
+    fn of(number: u64, mode: CampaignMode) -> Self {
+        let mut random = Random::new(3000 + number);
+        let beside_walks = mode == CampaignMode::Live;
+        let timing = RefitTiming {
+            beside_walks,
+            after_structures: random.happens(75).then(|| random.between(2, 4) as u32),
+            after_time: (beside_walks && random.happens(60)).then_some(25_000),
+        };
+        let refit = json!({ "max_versions": random.between(1, 3) });
+        // An eighth of the campaigns end because a version improves too little.
+        let stop = json!({ "min_improvement": (number % 8 == 6).then_some(1.5) });
+        Self { configuration: json!({ "refit": refit, "stop": stop }), timing, max_attempts: 2 }
+    }
+
+    pub fn rules(&self) -> RefitRules {
+        RefitRules::from_json(&self.configuration)
+    }
 }
 
 impl Scenario {
     /// The scenario of a seed.
     pub fn of(seed: u64) -> Self {
-        let has_agents = seed >= AGENT_SEEDS;
-        let number = seed % SCENARIOS + if has_agents { AGENT_SEEDS } else { 0 };
+        let (has_agents, has_refits) = ((AGENT_SEEDS..REFIT_SEEDS).contains(&seed), seed >= REFIT_SEEDS);
+        let first = if has_refits { REFIT_SEEDS } else { AGENT_SEEDS * u64::from(has_agents) };
+        let number = seed % SCENARIOS + first;
         let mut random = Random::new(1000 + number);
         let mode = if number.is_multiple_of(2) { CampaignMode::Reproducible } else { CampaignMode::Live };
         let settings = SelectorSettings {
@@ -45,7 +83,7 @@ impl Scenario {
             walks_per_round: 1 + random.below(3) as usize,
             ..settings(mode)
         };
-        let label_budget = (number % 4 == 3).then_some(5);
+        let label_budget = (number % 4 == 3 && !has_refits).then_some(5);
         Self {
             number,
             settings,
@@ -57,7 +95,29 @@ impl Scenario {
             queue_limit: if label_budget.is_none() && random.happens(60) { 3 } else { 1000 },
             label_budget,
             server: number % 8 >= 4,
+            refits: has_refits.then(|| RefitPlan::of(number, mode)),
         }
+    }
+
+    /// What happens in the walks from a seed structure with a version of the potential.
+    pub fn script(&self, seed_structure: usize, version: u32) -> Script {
+        if version == 0 {
+            return self.scripts[seed_structure].clone();
+        }
+        let place = 100 * u64::from(version) + seed_structure as u64;
+        let mut events = script(&mut Random::new(self.number ^ place << 16));
+        for event in &mut events {
+            if let Event::Structure { number, .. } = event {
+                // Some of them are known from the versions before.
+                *number += 8 * u64::from(version);
+            }
+        }
+        events
+    }
+
+    /// Whether versions and decision log must be those of the undisturbed run, so that labels may not depend on faults.
+    pub fn has_fixed_labels(&self) -> bool {
+        self.refits.is_some() && self.is_reproducible()
     }
 
     pub fn is_reproducible(&self) -> bool {

@@ -180,7 +180,8 @@ impl World {
         let of = |number: &usize| seed_structure(*number).structure == assignment.seed_structure;
         let script = (0..SEED_STRUCTURES).find(of).expect("one of the scenario");
         let pause = process.sigterm.then_some(2);
-        let report = advance(&self.scenario.scripts[script], assignment, mixture, pause);
+        let events = self.scenario.script(script, assignment.conditions.version);
+        let report = advance(&events, assignment, mixture, pause);
         self.tell(format!(
             "walker {} (incarnation {}) offers its report on walk {}, assignment {}: {}",
             key.number,

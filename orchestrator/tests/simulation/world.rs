@@ -18,12 +18,14 @@ use super::invariants::Known;
 use super::labeller::{Labeller, PROTOCOL};
 use super::planted::PlantedBug;
 use super::random::Random;
+use super::refit::RefitEvent;
+use super::refitter::RefitProcesses;
 use super::run::Run;
 use super::scenario::Scenario;
 use super::walker::{WalkerKey, WalkerProcess};
 
 /// The wall clock at the start, ms since 1970.
-const WALL_CLOCK: i64 = 1_700_000_000_000;
+pub const WALL_CLOCK: i64 = 1_700_000_000_000;
 /// After the last fault, the campaign must end within this time.
 const TIME_TO_END: Time = 700_000;
 /// More events than any simulation has that makes progress.
@@ -75,6 +77,7 @@ pub enum Event {
     AgentHeard(String),
     /// A run looks for silent agents.
     AgentExpiry(u64),
+    Refit(RefitEvent),
 }
 
 /// Something that happens at a time; of two at the same time, what was planned first.
@@ -135,6 +138,7 @@ pub struct World {
     pub agents: BTreeMap<u32, AgentProcess>,
     pub labellers: BTreeMap<u32, Labeller>,
     pub calculations: BTreeMap<String, Calculation>,
+    pub refits: RefitProcesses,
     pub known: Known,
     pub violation: Option<String>,
     /// Faults of links that last, with their end.
@@ -162,6 +166,10 @@ impl World {
             let budget = Budget { labels: scenario.label_budget, ..Budget::default() };
             runtime.block_on(store.set_budget(&budget)).unwrap();
         }
+        if let Some(refits) = &scenario.refits {
+            let configuration = refits.configuration.to_string();
+            runtime.block_on(store.set_configuration_in_force(&configuration, &[], 0)).unwrap();
+        }
         let direct = runtime.block_on(super::invariants::connect(directory));
         let mut world = Self {
             now: 0,
@@ -176,6 +184,7 @@ impl World {
             agents: BTreeMap::new(),
             labellers: BTreeMap::new(),
             calculations: BTreeMap::new(),
+            refits: RefitProcesses::default(),
             known: Known::default(),
             violation: None,
             links: Vec::new(),
@@ -226,7 +235,10 @@ impl World {
         if self.violation.is_none() {
             self.check_end();
         }
-        let log = self.store.runtime.block_on(self.store.store.decision_log_text()).unwrap();
+        let mut log = self.store.runtime.block_on(self.store.store.decision_log_text()).unwrap();
+        if self.scenario.refits.is_some() {
+            log += &self.versions_text();
+        }
         let Self { store, direct, violation, story, hasher, now, .. } = self;
         store.runtime.block_on(async {
             let _ = sqlx::Connection::close(direct).await;
@@ -333,6 +345,7 @@ impl World {
             Event::AgentRequest(key, request, bytes) => self.agent_request_arrives(key, request, bytes),
             Event::AgentHeard(id) => self.agent_heard(&id),
             Event::AgentExpiry(session) => self.agents_expire(session),
+            Event::Refit(event) => self.refit_event(event),
         }
     }
 
@@ -405,6 +418,10 @@ impl World {
             Fault::StopAgent { agent, until } => self.stop_agent(agent, until),
             Fault::MuteAgent { agent, until } => self.mute_agent(agent, until),
             Fault::KillAgentWalker { agent, walker, crash } => self.kill_agent_walker(agent, walker, crash),
+            Fault::KillRefitter { after, times, crash } => {
+                self.kill_refitter(after, times, if crash { Exit::Crash } else { Exit::Killed });
+            }
+            Fault::RollBack => self.roll_back(),
         }
     }
 
@@ -435,6 +452,7 @@ impl World {
         self.process_is_dead(&run.record.id);
         // Walkers die with the process that started them.
         self.walkers.retain(|key, _| key.session != session);
+        self.refitters_die_with(session);
         self.after(RESTART_DELAY, Event::StartRun);
     }
 
