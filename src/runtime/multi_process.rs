@@ -4,6 +4,7 @@
 
 use std::pin::Pin;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use calm::Mixture;
@@ -73,7 +74,8 @@ async fn run_in(
     let (mixture, original) = (Arc::clone(selector.mixture()), Arc::clone(selector.original()));
     let (devices, mixtures) =
         (campaign.model.devices(), HostMixtures { newest: &mixture, original: &original });
-    let memory = HostMemory::open(place, host_sizes(campaign), mixtures, session(process), devices)?;
+    let session = new_session(process);
+    let memory = HostMemory::open(place, host_sizes(campaign), mixtures, session, devices)?;
     let (model, addresses) = (campaign.walker_model()?, memory.addresses());
     let HostMemory { prepared: _prepared, mixture: shared, server, calls: _calls } = memory;
     // The manager cancels it too, when the run cannot continue.
@@ -97,7 +99,7 @@ async fn run_in(
 
     let (to_reactor, incoming) = mpsc::channel(CHANNEL);
     let local = server.run(shared, to_reactor.clone(), manager.listener());
-    let agents = AgentService::open(run, session(process), mixtures).await?;
+    let agents = AgentService::open(run, session, mixtures).await?;
     let no_more_work = CancellationToken::new();
     let walks = stopping.child_token();
     // Agents stop too when walks cannot continue here: with a later run, they join again.
@@ -111,9 +113,12 @@ async fn run_in(
     supervise(manager, reactor, no_more_work, serving, run).await
 }
 
-/// Distinguishes the walkers of this run from those of any other.
-fn session(process: &ProcessRecord) -> u64 {
-    let hash = blake3::hash(process.id.as_bytes());
+/// Distinguishes the walkers of this run, with one version of the potential, from those of any other run and version. An agent that was
+/// lost with one version may return with the next: its slots have the numbers of those that another agent has got meanwhile.
+fn new_session(process: &ProcessRecord) -> u64 {
+    static SESSIONS: AtomicU64 = AtomicU64::new(0);
+    let number = SESSIONS.fetch_add(1, Ordering::Relaxed);
+    let hash = blake3::hash(format!("{} {number}", process.id).as_bytes());
     let [a, b, c, d, e, f, g, h, ..] = *hash.as_bytes();
     u64::from_le_bytes([a, b, c, d, e, f, g, h])
 }
@@ -210,4 +215,15 @@ fn database_unreachable() -> CommandError {
 /// The result of a task. A panic is a failure too.
 fn flatten<T>(ended: Result<Result<T, impl ToString>, JoinError>) -> Result<T, CommandError> {
     ended.map_err(CommandError::failed)?.map_err(CommandError::failed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn walks_of_each_version_have_a_session_of_their_own() {
+        let process = ProcessRecord::new(ProcessRecord::ORCHESTRATOR, None, 7, 0);
+        assert_ne!(new_session(&process), new_session(&process));
+    }
 }

@@ -15,6 +15,7 @@ use workers::agent::{AgentCore, ExchangeEnd};
 
 use super::fault::{Direction, FIRST_AGENT, Time};
 use super::planted::PlantedBug;
+use super::refit::RunRefits;
 use super::scenario::SEED_STRUCTURES;
 use super::world::{Event, World};
 use crate::common::scripted::advance;
@@ -83,6 +84,8 @@ pub struct AgentProcess {
     process: u32,
     core: AgentCore<AgentRegistration>,
     session: u64,
+    /// What it starts its walkers with: the number of the version of the potential.
+    setup: Vec<u8>,
     mixtures: VecDeque<Arc<Mixture>>,
     walkers: Vec<HostWalker>,
     conversations: BTreeMap<u64, Conversation>,
@@ -120,6 +123,7 @@ impl World {
             process,
             core: AgentCore::default(),
             session: 0,
+            setup: Vec::new(),
             mixtures: VecDeque::new(),
             walkers: (0..WALKERS).map(|_| HostWalker::default()).collect(),
             conversations: BTreeMap::new(),
@@ -197,6 +201,10 @@ impl World {
         if !self.is_active(session, || Event::AgentRequest(key, request, bytes.clone())) {
             return;
         }
+        if self.runs[&session].refits.as_ref().is_some_and(RunRefits::walks_are_over) {
+            // Nobody serves agents until the walks of the next version.
+            return;
+        }
         self.runs.get_mut(&session).unwrap().agents.receive(request, &bytes);
         self.pump(session);
     }
@@ -221,6 +229,7 @@ impl World {
                 Err(why) => self.agent_fails(key, &why),
             },
             Conversation::Mixture(joined) => match datagram::read_first_mixture(bytes) {
+                Ok(_) if agent.session > 0 && joined.setup != agent.setup => self.agent_begins_again(key),
                 Ok(mixture) => {
                     agent.mixtures.push_back(Arc::new(mixture));
                     agent.core.has_joined(joined);
@@ -244,6 +253,15 @@ impl World {
                 self.agents.get_mut(&next.agent).unwrap().stopped_until = self.now + RESTART_AFTER_LEAVING;
             }
         }
+    }
+
+    /// An agent that has to start its walkers with something else joins again, as the same one.
+    fn agent_begins_again(&mut self, key: AgentKey) {
+        let Some(before) = self.agents.remove(&key.agent) else { return };
+        self.tell(format!("agent {} is set up anew", key.agent));
+        self.start_agent(key.agent, key.process + 1);
+        let agent = self.agents.get_mut(&key.agent).unwrap();
+        (agent.info, agent.muted_until) = (before.info, before.muted_until);
     }
 
     fn slot_advances(
@@ -300,7 +318,7 @@ impl World {
         let of_process = |agent: &&mut AgentProcess| agent.process == key.process;
         let Some(agent) = self.agents.get_mut(&key.agent).filter(of_process) else { return };
         if let Some(joined) = agent.core.take_joined() {
-            agent.session = joined.session;
+            (agent.session, agent.setup) = (joined.session, joined.setup);
             let first = agent.core.start(joined.slots);
             self.tell(format!("agent {} has joined run {}", key.agent, joined.session));
             first.into_iter().for_each(|(slot, report)| self.exchange(key, slot, report));
@@ -312,7 +330,11 @@ impl World {
             (of.reply, of.work) = (None, answer);
             of.count += 1;
             if of.work.is_some() {
-                let count = of.count;
+                let (count, version) = (of.count, of.work.as_ref().map(|work| work.assignment.conditions.version));
+                let known = String::from_utf8_lossy(&agent.setup).into_owned();
+                if version.is_some_and(|version| version.to_string() != known) {
+                    self.fail(format!("agent {} has a walk of another version than {known}", key.agent));
+                }
                 let time = self.random.between(1_500, 5_000);
                 self.after(time, Event::Agent(key, AgentEventKind::WalkerFinishes(walker, count)));
             }
@@ -412,7 +434,7 @@ impl World {
             }
             AgentEvent::Joined(joined) => {
                 let number = joined.host.trim_start_matches("host ").parse::<u32>().unwrap_or_default();
-                let newest = self.agents.get(&number).map(|agent| (agent.process, agent.info.id.clone()));
+                let newest = self.agents.get(&number).map(|agent| (agent.info.pid, agent.info.id.clone()));
                 if newest.is_some_and(|(process, id)| process != joined.pid && id == joined.id) {
                     self.fail(format!("a dead process of agent {number} replaces the living one"));
                 }

@@ -62,10 +62,12 @@ pub enum PlantedBug {
     RefitAbandoned,
     /// A version that was refused is taken up.
     RefusedVersionTakenUp,
+    /// The server of agents has the same session with each version of the potential.
+    AgentSessionReused,
 }
 
 impl PlantedBug {
-    pub const ALL: [Self; 28] = [
+    pub const ALL: [Self; 29] = [
         Self::AnswerBeforeCommit,
         Self::FailedCommitBelieved,
         Self::CommitRepeated,
@@ -94,6 +96,7 @@ impl PlantedBug {
         Self::OldWalksContinue,
         Self::RefitAbandoned,
         Self::RefusedVersionTakenUp,
+        Self::AgentSessionReused,
     ];
 }
 
@@ -108,7 +111,8 @@ impl PlantedBug {
             | Self::VersionRecordedTwice
             | Self::OldWalksContinue
             | Self::RefitAbandoned
-            | Self::RefusedVersionTakenUp => REFIT_SEEDS,
+            | Self::RefusedVersionTakenUp
+            | Self::AgentSessionReused => REFIT_SEEDS,
             _ => 0,
         }
     }
@@ -141,7 +145,8 @@ impl PlantedBug {
             | Self::VersionRecordedTwice
             | Self::OldWalksContinue
             | Self::RefitAbandoned
-            | Self::RefusedVersionTakenUp => self.first_seed(),
+            | Self::RefusedVersionTakenUp
+            | Self::AgentSessionReused => self.first_seed(),
         }
     }
 }

@@ -63,6 +63,11 @@ impl RunRefits {
         Self { version, stage, supervisor, wait_until: 0, superseded: false, walks_end: false }
     }
 
+    /// Whether all walks have ended, and with them what served them.
+    pub fn walks_are_over(&self) -> bool {
+        self.stage != Stage::Walks
+    }
+
     /// Whether walks have ended for those of a newer version.
     pub fn makes_room(&self) -> bool {
         self.superseded

@@ -13,6 +13,7 @@ use store::records::Commit;
 use store::{CampaignLock, ProcessRecord, Store, StoreError};
 use tokio_util::sync::CancellationToken;
 use wire::datagram::DatagramServer;
+use wire::net::AgentBootstrap;
 use wire::net::datagram::AgentDatagramServer;
 
 use super::agent::AGENT_TIMEOUT;
@@ -114,9 +115,11 @@ impl World {
     ) {
         let stopping = CancellationToken::new();
         let limits = Limits { detached: true, ..LIMITS };
+        let reuses = self.bug == Some(PlantedBug::AgentSessionReused);
         let agents = AgentDatagramServer::new(
-            session,
+            if reuses { self.store.generation } else { session },
             AGENT_TIMEOUT,
+            AgentBootstrap { setup: version.to_string().into_bytes(), ..AgentBootstrap::default() },
             Arc::clone(selector.mixture()),
             selector.original(),
             stopping.clone(),

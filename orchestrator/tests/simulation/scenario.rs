@@ -72,9 +72,10 @@ impl RefitPlan {
 impl Scenario {
     /// The scenario of a seed.
     pub fn of(seed: u64) -> Self {
-        let (has_agents, has_refits) = ((AGENT_SEEDS..REFIT_SEEDS).contains(&seed), seed >= REFIT_SEEDS);
-        let first = if has_refits { REFIT_SEEDS } else { AGENT_SEEDS * u64::from(has_agents) };
-        let number = seed % SCENARIOS + first;
+        let has_refits = seed >= REFIT_SEEDS;
+        let number = seed % SCENARIOS + [0, AGENT_SEEDS, REFIT_SEEDS].into_iter().rfind(|first| seed >= *first).unwrap();
+        // With refits, a file and a server have agents, in live and in reproducible mode.
+        let has_agents = if has_refits { [3, 4].contains(&(seed % SCENARIOS)) } else { seed >= AGENT_SEEDS };
         let mut random = Random::new(1000 + number);
         let mode = if number.is_multiple_of(2) { CampaignMode::Reproducible } else { CampaignMode::Live };
         let settings = SelectorSettings {

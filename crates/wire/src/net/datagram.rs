@@ -62,12 +62,12 @@ impl AgentDatagramServer {
     pub fn new(
         session: u64,
         agent_timeout: Duration,
+        bootstrap: AgentBootstrap,
         mixture: Arc<Mixture>,
         original: &Mixture,
         stopping: CancellationToken,
     ) -> Self {
         let mixtures = AgentMixtures::new(mixture, original);
-        let bootstrap = AgentBootstrap::default();
         Self(AgentSession::new(session, ReplyQueue::default(), agent_timeout, bootstrap, mixtures, stopping))
     }
 
@@ -125,6 +125,8 @@ pub struct AgentRegistration {
     pub mixture_version: u64,
     /// The slots of the agent.
     pub slots: Vec<Slot>,
+    /// What it starts its walkers with.
+    pub setup: Vec<u8>,
 }
 
 impl AgentRegistration {
@@ -141,7 +143,8 @@ impl AgentRegistration {
         let AgentReply::Joined(joined) = decode_reply(reply)? else { return Err(unexpected("join")) };
         let (session, first) = (joined.session, joined.first_slot);
         let slots = (first..first + agent.slots()).map(|number| Slot::new(session, number)).collect();
-        Ok(Self { session, mixture_version: joined.mixture_version, slots })
+        let setup = joined.setup.to_vec();
+        Ok(Self { session, mixture_version: joined.mixture_version, slots, setup })
     }
 }
 
