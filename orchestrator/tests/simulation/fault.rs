@@ -110,6 +110,11 @@ pub enum Fault {
         agent: u32,
         until: Time,
     },
+    /// Neither messages nor the heartbeat of an agent pass, in any direction.
+    LoseAgent {
+        agent: u32,
+        until: Time,
+    },
     /// A walker of an agent is killed.
     KillAgentWalker {
         agent: u32,
@@ -180,7 +185,7 @@ impl Fault {
     }
 
     /// A fault of refits.
-    fn draw_of_refits(random: &mut Random, scenario: &Scenario, _: Time) -> Self {
+    fn draw_of_refits(random: &mut Random, scenario: &Scenario, at: Time) -> Self {
         match random.below(10) {
             0..4 => {
                 let moment = [Moment::BeforeCommit, Moment::AfterCommit][random.below(2) as usize];
@@ -188,6 +193,10 @@ impl Fault {
             }
             4..6 => Self::KillOrchestrator,
             6 if !scenario.is_reproducible() => Self::RollBack,
+            7..9 if scenario.agents > 0 => {
+                let agent = random.below(scenario.agents.into()) as u32;
+                Self::LoseAgent { agent, until: at + random.between(20_000, 60_000) }
+            }
             _ => Self::kill_refitter(random),
         }
     }
@@ -258,6 +267,7 @@ impl Fault {
             | Self::Hang { until }
             | Self::StopAgent { until, .. }
             | Self::MuteAgent { until, .. }
+            | Self::LoseAgent { until, .. }
             | Self::PauseWalks { until } => *until,
             _ => at,
         }
@@ -271,7 +281,8 @@ pub fn plan(seed: u64, scenario: &Scenario) -> Vec<PlannedFault> {
     let mut plan: Vec<PlannedFault> = (0..number)
         .map(|_| {
             let at = random.below(LAST_BEGIN);
-            let of_agents = scenario.agents > 0 && random.happens(60);
+            let share_of_agents = if scenario.refits.is_some() { 30 } else { 60 };
+            let of_agents = scenario.agents > 0 && random.happens(share_of_agents);
             let of_refits = scenario.refits.is_some() && random.happens(50);
             let draw = match (of_agents, of_refits) {
                 (true, _) => Fault::draw_of_agents,
@@ -370,6 +381,9 @@ impl fmt::Display for Fault {
             Self::StopAgent { agent, until } => write!(f, "agent {agent} hangs until {} s", seconds(until)),
             Self::MuteAgent { agent, until } => {
                 write!(f, "the heartbeat of agent {agent} is missing until {} s", seconds(until))
+            }
+            Self::LoseAgent { agent, until } => {
+                write!(f, "agent {agent} cannot be reached until {} s", seconds(until))
             }
             Self::KillAgentWalker { agent, walker, .. } => {
                 write!(f, "walker {walker} of agent {agent} is killed")

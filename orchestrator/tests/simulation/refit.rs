@@ -133,19 +133,20 @@ impl World {
         if !self.is_active(session, || Event::Refit(RefitEvent::Check(session))) {
             return;
         }
+        let now = self.now;
         let refits = self.refits_of(session).expect("a campaign with refits");
         if refits.stage != Stage::Walks {
             return;
         }
-        let (version, may_start) = (refits.version, refits.supervisor.is_none());
-        let waits = refits.wait_until > self.now;
+        let (version, may_start) =
+            (refits.version, refits.supervisor.is_none() && refits.wait_until <= now);
         self.watch_refits(session);
         let Ok(schedule) = self.refit_schedule() else { return };
         match schedule.beside_walks(version, WALL_CLOCK, self.wall_clock()) {
             BesideWalks::Superseded => self.walks_make_room(session, true),
             BesideWalks::WalksEnd => self.walks_make_room(session, false),
-            BesideWalks::RefitDue if may_start && !waits => {
-                let another = self.store.read(self.now, is_another_running);
+            BesideWalks::RefitDue if may_start => {
+                let another = self.store.read(now, is_another_running);
                 if another.is_ok_and(|another| !another) {
                     self.start_refit(session);
                 }

@@ -12,7 +12,7 @@ use store::{Budget, ProcessRecord, RelabelRequest, Store};
 
 use super::agent::{AgentEventKind, AgentKey, AgentProcess};
 use super::calculation::Calculation;
-use super::fault::{ClientKind, Direction, Fault, LinkTrouble, PlannedFault, Time};
+use super::fault::{ClientKind, Direction, FIRST_AGENT, Fault, LinkTrouble, PlannedFault, Time};
 use super::faulty_store::FaultyStore;
 use super::invariants::Known;
 use super::labeller::{Labeller, PROTOCOL};
@@ -417,6 +417,12 @@ impl World {
             Fault::KillAgent { agent } => self.kill_agent(agent),
             Fault::StopAgent { agent, until } => self.stop_agent(agent, until),
             Fault::MuteAgent { agent, until } => self.mute_agent(agent, until),
+            Fault::LoseAgent { agent, until } => {
+                for direction in [Direction::ToOrchestrator, Direction::ToWalker] {
+                    self.links.push((FIRST_AGENT + agent, direction, LinkTrouble::Cut, until));
+                }
+                self.mute_agent(agent, until);
+            }
             Fault::KillAgentWalker { agent, walker, crash } => self.kill_agent_walker(agent, walker, crash),
             Fault::KillRefitter { after, times, crash } => {
                 self.kill_refitter(after, times, if crash { Exit::Crash } else { Exit::Killed });
