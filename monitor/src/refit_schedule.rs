@@ -149,8 +149,11 @@ mod tests {
     /// Without versions; times in s.
     fn schedule(timing: (Option<u32>, Option<i64>), accepted: u64, max_versions: usize) -> RefitSchedule {
         let (after_structures, after_time) = timing;
-        let timing =
-            RefitTiming { beside_walks: true, after_structures, after_time: after_time.map(|time| 1000 * time) };
+        let timing = RefitTiming {
+            beside_walks: true,
+            after_structures,
+            after_time: after_time.map(|time| 1000 * time),
+        };
         let rules = RefitRules { max_versions, ..RefitRules::default() };
         let progress = RefitProgress { rules, accepted, ..RefitProgress::default() };
         RefitSchedule { timing, progress, taken_up: 0 }
@@ -265,10 +268,7 @@ mod tests {
         schedule.progress.versions = vec![version(1, VersionState::Refused, 4)];
         assert!(!schedule.is_due_beside_walks(0, i64::MAX));
         schedule.progress.has_new_labels = true;
-        assert!(
-            schedule.is_due_beside_walks(0, 30_000)
-                && !schedule.is_due_beside_walks(0, 29_999)
-        );
+        assert!(schedule.is_due_beside_walks(0, 30_000) && !schedule.is_due_beside_walks(0, 29_999));
         assert!(schedule.progress.is_refit_left());
     }
 
@@ -320,7 +320,10 @@ mod tests {
         assert_eq!(schedule.after_walks(0, true), AfterWalks::NewerVersion);
         // Nothing is new since, but a refit may run that began before.
         assert_eq!(schedule.beside_walks(1, 0, 0), BesideWalks::GoOn);
-        assert_eq!([true, false].map(|runs| schedule.after_walks(1, runs)), [AfterWalks::Refit, AfterWalks::End]);
+        assert_eq!(
+            [true, false].map(|runs| schedule.after_walks(1, runs)),
+            [AfterWalks::Refit, AfterWalks::End]
+        );
         // No walk starts with the last version.
         schedule.taken_up = 1;
         schedule.progress.accepted = 9;

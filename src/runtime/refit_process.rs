@@ -18,8 +18,8 @@ use crate::exit_status::CommandError;
 use crate::log;
 use crate::output::{log_and_print, log_and_warn};
 use crate::process_config;
-use crate::refit::{self, schedule};
 use crate::refit::settings::RefitterConfig;
+use crate::refit::{self, schedule};
 
 /// Interval between checks for a due refit and for newer versions of a live campaign.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);
@@ -178,7 +178,9 @@ impl<'a> RefitProcess<'a> {
         match schedule.beside_walks(campaign.version_number(), begin, unix_milliseconds()) {
             BesideWalks::Superseded => {
                 if !superseded.is_cancelled() {
-                    log_and_print("a newer version of the potential is registered: the walks with this one end");
+                    log_and_print(
+                        "a newer version of the potential is registered: the walks with this one end",
+                    );
                 }
                 superseded.cancel();
             }
@@ -234,7 +236,11 @@ fn how_it_failed(children: &mut Children) -> Option<RefitEnd> {
     let how = all_failed_message(children)?;
     let error = CommandError::Failed(format!("the refit failed: {how}; the same command continues it"));
     let last = children.status().into_iter().next_back().and_then(|child| child.last_failure);
-    Some(if last.is_some_and(|reason| reason.is_reported()) { RefitEnd::CannotGoOn(error) } else { RefitEnd::Crashed(error) })
+    Some(if last.is_some_and(|reason| reason.is_reported()) {
+        RefitEnd::CannotGoOn(error)
+    } else {
+        RefitEnd::Crashed(error)
+    })
 }
 
 /// When the campaign began, ms since 1970.

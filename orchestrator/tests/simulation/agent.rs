@@ -330,7 +330,8 @@ impl World {
             (of.reply, of.work) = (None, answer);
             of.count += 1;
             if of.work.is_some() {
-                let (count, version) = (of.count, of.work.as_ref().map(|work| work.assignment.conditions.version));
+                let (count, version) =
+                    (of.count, of.work.as_ref().map(|work| work.assignment.conditions.version));
                 let known = String::from_utf8_lossy(&agent.setup).into_owned();
                 if version.is_some_and(|version| version.to_string() != known) {
                     self.fail(format!("agent {} has a walk of another version than {known}", key.agent));

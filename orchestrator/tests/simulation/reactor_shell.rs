@@ -185,7 +185,8 @@ impl World {
         let makes_room = run.refits.as_ref().is_some_and(RunRefits::makes_room);
         let pending = self.store.read(now, async |store| store.has_pending_labels(wall).await);
         // Walks of a newer version do not wait for the labels of those that made room.
-        if makes_room || pending.is_ok_and(|pending| !pending) || self.bug == Some(PlantedBug::QueueAbandoned) {
+        if makes_room || pending.is_ok_and(|pending| !pending) || self.bug == Some(PlantedBug::QueueAbandoned)
+        {
             let actions = run.labellers.stop(elapsed);
             self.act_on_labellers(session, actions);
         }

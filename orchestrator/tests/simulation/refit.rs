@@ -138,8 +138,7 @@ impl World {
         if refits.stage != Stage::Walks {
             return;
         }
-        let (version, may_start) =
-            (refits.version, refits.supervisor.is_none() && refits.wait_until <= now);
+        let (version, may_start) = (refits.version, refits.supervisor.is_none() && refits.wait_until <= now);
         self.watch_refits(session);
         let Ok(schedule) = self.refit_schedule() else { return };
         match schedule.beside_walks(version, WALL_CLOCK, self.wall_clock()) {
@@ -204,7 +203,9 @@ impl World {
         };
         match schedule.after_walks(version, is_running) {
             AfterWalks::NewerVersion => self.stop_refit(session),
-            AfterWalks::Refit if self.bug == Some(PlantedBug::RefitAbandoned) => self.finish_run(session, true),
+            AfterWalks::Refit if self.bug == Some(PlantedBug::RefitAbandoned) => {
+                self.finish_run(session, true)
+            }
             AfterWalks::Refit => {
                 self.refits_of(session).expect("as above").stage = Stage::Refit;
                 if !is_running {

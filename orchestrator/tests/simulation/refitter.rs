@@ -68,8 +68,7 @@ impl World {
         let id = self.refits.started;
         let record = self.process_record(ProcessRecord::REFITTER, None, format!("refitter-{id}"));
         self.tell(format!("refitter {id} starts"));
-        let refitter =
-            Refitter { session, parent, step: Step::Begins, record, has_lock: false, stop: false };
+        let refitter = Refitter { session, parent, step: Step::Begins, record, has_lock: false, stop: false };
         self.refits.running.insert(id, refitter);
         if !self.refits.kills.is_empty() {
             let (after, exit) = self.refits.kills.remove(0);
@@ -238,7 +237,8 @@ impl World {
             return (VersionRecord { reason: reason.to_owned(), figures, ..attempt }, None);
         }
         let model = format!("model {number} from {parent}, trained on {label_set}");
-        let files = VersionFiles { model: model.into_bytes(), mixture: format!("mixture {number}").into_bytes() };
+        let files =
+            VersionFiles { model: model.into_bytes(), mixture: format!("mixture {number}").into_bytes() };
         let [model_hash, mixture_hash] = files.hashes();
         let error = random.between(50, 99) as f64 / 100.0;
         let set = json!({

@@ -73,7 +73,8 @@ impl Scenario {
     /// The scenario of a seed.
     pub fn of(seed: u64) -> Self {
         let has_refits = seed >= REFIT_SEEDS;
-        let number = seed % SCENARIOS + [0, AGENT_SEEDS, REFIT_SEEDS].into_iter().rfind(|first| seed >= *first).unwrap();
+        let number = seed % SCENARIOS
+            + [0, AGENT_SEEDS, REFIT_SEEDS].into_iter().rfind(|first| seed >= *first).unwrap();
         // With refits, a file and a server have agents, in live and in reproducible mode.
         let has_agents = if has_refits { [3, 4].contains(&(seed % SCENARIOS)) } else { seed >= AGENT_SEEDS };
         let mut random = Random::new(1000 + number);
