@@ -196,6 +196,9 @@ fn planted_bugs_are_found() {
         let seeds = first.into_iter().chain(bug.first_seed()..bug.first_seed() + SEEDS_TO_FIND);
         let found = { seeds }.find_map(|seed| Some((seed, broken_by(seed, bug)?)));
         match found {
+            Some((seed, _)) if only.is_some() => {
+                println!("{}", shrink::story_of_failure(seed, &plan(seed, &Scenario::of(seed)), Some(bug)));
+            }
             Some((seed, broken)) => println!("{bug:?}: seed {seed}: {broken}"),
             None => missed.push(bug),
         }

@@ -140,13 +140,11 @@ impl PlantedBug {
             Self::CalculationRecordedLate => 57,
             Self::AgentLossForgotten => AGENT_SEEDS,
             Self::LateReplyBelieved | Self::OldSlotsKept => AGENT_SEEDS + 1,
-            Self::AgentIdReused
-            | Self::VersionLimitForgotten
-            | Self::VersionRecordedTwice
-            | Self::OldWalksContinue
-            | Self::RefitAbandoned
-            | Self::RefusedVersionTakenUp
-            | Self::AgentSessionReused => self.first_seed(),
+            Self::AgentIdReused | Self::RefitAbandoned | Self::RefusedVersionTakenUp => self.first_seed(),
+            Self::VersionLimitForgotten | Self::VersionRecordedTwice | Self::OldWalksContinue => {
+                REFIT_SEEDS + 1
+            }
+            Self::AgentSessionReused => REFIT_SEEDS + 220,
         }
     }
 }

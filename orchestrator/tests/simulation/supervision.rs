@@ -125,15 +125,20 @@ impl World {
         self.pump(session);
     }
 
-    /// A labeller has ended; a run that started or adopted it releases its leases.
+    /// A labeller has ended: every run that started or adopted it learns of it, also one that was replaced meanwhile.
     pub fn labeller_gone(&mut self, id: u32, record: String, exit: Exit) {
         let of = |run: &Run| {
             run.labeller_processes.iter().find(|(_, (of, _))| *of == id).map(|(number, _)| *number)
         };
-        let Some((session, number)) = self.runs.iter().find_map(|(session, run)| Some((*session, of(run)?)))
-        else {
-            return;
-        };
+        let runs: Vec<(u64, u32)> =
+            self.runs.iter().filter_map(|(session, run)| Some((*session, of(run)?))).collect();
+        for (session, number) in runs {
+            self.labeller_gone_from(session, number, (id, record.clone(), exit));
+        }
+    }
+
+    /// A run releases the leases of a labeller that has ended.
+    fn labeller_gone_from(&mut self, session: u64, number: u32, (id, record, exit): (u32, String, Exit)) {
         if !self.is_active(session, || Event::LabellerGone(id, record.clone(), exit)) {
             return;
         }
