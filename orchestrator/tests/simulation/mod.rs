@@ -44,7 +44,7 @@ const SEEDS: u64 = 64;
 /// The same with agents.
 const SEEDS_WITH_AGENTS: u64 = 24;
 /// The same with refits.
-const SEEDS_WITH_REFITS: u64 = 12;
+const SEEDS_WITH_REFITS: u64 = 8;
 /// A planted bug must be found within this number of seeds.
 const SEEDS_TO_FIND: u64 = 1_000;
 

@@ -62,12 +62,10 @@ pub enum PlantedBug {
     RefitAbandoned,
     /// A version that was refused is taken up.
     RefusedVersionTakenUp,
-    /// The server of agents has the same session with each version of the potential.
-    AgentSessionReused,
 }
 
 impl PlantedBug {
-    pub const ALL: [Self; 29] = [
+    pub const ALL: [Self; 28] = [
         Self::AnswerBeforeCommit,
         Self::FailedCommitBelieved,
         Self::CommitRepeated,
@@ -96,7 +94,6 @@ impl PlantedBug {
         Self::OldWalksContinue,
         Self::RefitAbandoned,
         Self::RefusedVersionTakenUp,
-        Self::AgentSessionReused,
     ];
 }
 
@@ -111,8 +108,7 @@ impl PlantedBug {
             | Self::VersionRecordedTwice
             | Self::OldWalksContinue
             | Self::RefitAbandoned
-            | Self::RefusedVersionTakenUp
-            | Self::AgentSessionReused => REFIT_SEEDS,
+            | Self::RefusedVersionTakenUp => REFIT_SEEDS,
             _ => 0,
         }
     }
@@ -144,7 +140,6 @@ impl PlantedBug {
             Self::VersionLimitForgotten | Self::VersionRecordedTwice | Self::OldWalksContinue => {
                 REFIT_SEEDS + 1
             }
-            Self::AgentSessionReused => REFIT_SEEDS + 220,
         }
     }
 }

@@ -115,9 +115,8 @@ impl World {
     ) {
         let stopping = CancellationToken::new();
         let limits = Limits { detached: true, ..LIMITS };
-        let reuses = self.bug == Some(PlantedBug::AgentSessionReused);
         let agents = AgentDatagramServer::new(
-            if reuses { self.store.generation } else { session },
+            session,
             AGENT_TIMEOUT,
             AgentBootstrap { setup: version.to_string().into_bytes(), ..AgentBootstrap::default() },
             Arc::clone(selector.mixture()),
