@@ -13,12 +13,16 @@ mod fault;
 mod faulty_store;
 mod invariants;
 mod labeller;
+mod ladder;
 mod planted;
 mod random;
 mod reactor_shell;
 mod run;
 mod scenario;
 mod shrink;
+mod slurm;
+mod slurm_files;
+mod slurm_labeller;
 mod supervision;
 mod walker;
 mod world;
@@ -32,7 +36,7 @@ use tempfile::TempDir;
 
 use self::fault::{PlannedFault, plan};
 use self::planted::PlantedBug;
-use self::scenario::{AGENT_SEEDS, SEED_STRUCTURES, Scenario};
+use self::scenario::{AGENT_SEEDS, SEED_STRUCTURES, SLURM_SEEDS, Scenario};
 use self::world::{Outcome, World};
 use crate::common::{CAMPAIGN, seed_structure};
 
@@ -40,6 +44,8 @@ use crate::common::{CAMPAIGN, seed_structure};
 const SEEDS: u64 = 64;
 /// The same with agents.
 const SEEDS_WITH_AGENTS: u64 = 24;
+/// The same with Slurm jobs.
+const SEEDS_WITH_SLURM: u64 = 16;
 /// A planted bug must be found within this number of seeds.
 const SEEDS_TO_FIND: u64 = 1_000;
 
@@ -146,6 +152,12 @@ fn no_seed_breaks_an_invariant() {
 #[test]
 fn no_seed_with_agents_breaks_an_invariant() {
     check_seeds(AGENT_SEEDS..AGENT_SEEDS + number_in("CALMWALK_SEEDS").unwrap_or(SEEDS_WITH_AGENTS));
+}
+
+/// The same with calculations as Slurm jobs, and with jobs of different difficulty.
+#[test]
+fn no_seed_with_slurm_breaks_an_invariant() {
+    check_seeds(SLURM_SEEDS..SLURM_SEEDS + number_in("CALMWALK_SEEDS").unwrap_or(SEEDS_WITH_SLURM));
 }
 
 fn check_seeds(seeds: std::ops::Range<u64>) {

@@ -1,7 +1,7 @@
 //! Mistakes that are made on purpose, to see that the simulation finds them. They are made at the edges, never in the
 //! program itself.
 
-use super::scenario::AGENT_SEEDS;
+use super::scenario::{AGENT_SEEDS, SLURM_SEEDS};
 
 /// A mistake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -52,10 +52,24 @@ pub enum PlantedBug {
     LateReplyBelieved,
     /// An agent that has lost its registration starts again with the slots of the old one.
     OldSlotsKept,
+    /// A labeller does not see whether a Slurm job has begun.
+    BegunOverlooked,
+    /// A labeller takes a Slurm that does not answer for one that knows no job.
+    SilenceTakenAsGone,
+    /// A labeller does not wait until files of nodes are visible.
+    FilesBelievedAtOnce,
+    /// A labeller judges a calculation by an answer of Slurm from before it began.
+    OldAnswerBelieved,
+    /// A labeller does not read why Slurm ended a job.
+    EndsMixedUp,
+    /// The loss of a node counts as an attempt.
+    NodeFailuresCounted,
+    /// Each attempt begins with the first adjustments again.
+    LadderRestarted,
 }
 
 impl PlantedBug {
-    pub const ALL: [Self; 23] = [
+    pub const ALL: [Self; 30] = [
         Self::AnswerBeforeCommit,
         Self::FailedCommitBelieved,
         Self::CommitRepeated,
@@ -79,6 +93,13 @@ impl PlantedBug {
         Self::AgentIdReused,
         Self::LateReplyBelieved,
         Self::OldSlotsKept,
+        Self::BegunOverlooked,
+        Self::SilenceTakenAsGone,
+        Self::FilesBelievedAtOnce,
+        Self::OldAnswerBelieved,
+        Self::EndsMixedUp,
+        Self::NodeFailuresCounted,
+        Self::LadderRestarted,
     ];
 }
 
@@ -89,6 +110,13 @@ impl PlantedBug {
             Self::AgentLossForgotten | Self::AgentIdReused | Self::LateReplyBelieved | Self::OldSlotsKept => {
                 AGENT_SEEDS
             }
+            Self::BegunOverlooked
+            | Self::SilenceTakenAsGone
+            | Self::FilesBelievedAtOnce
+            | Self::OldAnswerBelieved
+            | Self::EndsMixedUp
+            | Self::NodeFailuresCounted
+            | Self::LadderRestarted => SLURM_SEEDS,
             _ => 0,
         }
     }
@@ -117,6 +145,13 @@ impl PlantedBug {
             Self::AgentLossForgotten => AGENT_SEEDS,
             Self::LateReplyBelieved | Self::OldSlotsKept => AGENT_SEEDS + 1,
             Self::AgentIdReused => self.first_seed(),
+            Self::BegunOverlooked
+            | Self::SilenceTakenAsGone
+            | Self::FilesBelievedAtOnce
+            | Self::OldAnswerBelieved
+            | Self::EndsMixedUp
+            | Self::NodeFailuresCounted
+            | Self::LadderRestarted => SLURM_SEEDS,
         }
     }
 }

@@ -11,6 +11,8 @@ use crate::common::settings;
 pub const SCENARIOS: u64 = 8;
 /// Seeds from this one on have agents on other hosts.
 pub const AGENT_SEEDS: u64 = 1 << 32;
+/// Seeds from this one on label in Slurm jobs, and their jobs are of different difficulty.
+pub const SLURM_SEEDS: u64 = 1 << 34;
 /// Number of seed structures.
 pub const SEED_STRUCTURES: usize = 3;
 
@@ -24,6 +26,8 @@ pub struct Scenario {
     /// Agents on other hosts, each with two walkers and an assignment in reserve.
     pub agents: u32,
     pub labellers: u32,
+    /// Calculations are Slurm jobs.
+    pub slurm: bool,
     /// Walkers wait while more label jobs are unfinished.
     pub queue_limit: u64,
     /// Number of labels that the campaign may make.
@@ -35,8 +39,14 @@ pub struct Scenario {
 impl Scenario {
     /// The scenario of a seed.
     pub fn of(seed: u64) -> Self {
-        let has_agents = seed >= AGENT_SEEDS;
-        let number = seed % SCENARIOS + if has_agents { AGENT_SEEDS } else { 0 };
+        let slurm = seed >= SLURM_SEEDS;
+        let has_agents = seed >= AGENT_SEEDS && !slurm;
+        let number = seed % SCENARIOS
+            + match (has_agents, slurm) {
+                (true, _) => AGENT_SEEDS,
+                (_, true) => SLURM_SEEDS,
+                _ => 0,
+            };
         let mut random = Random::new(1000 + number);
         let mode = if number.is_multiple_of(2) { CampaignMode::Reproducible } else { CampaignMode::Live };
         let settings = SelectorSettings {
@@ -52,7 +62,8 @@ impl Scenario {
             scripts: (0..SEED_STRUCTURES).map(|_| script(&mut random)).collect(),
             walkers: if has_agents { 1 } else { random.between(2, 4) as u32 },
             agents: if has_agents { 2 } else { 0 },
-            labellers: random.between(1, 2) as u32,
+            labellers: if slurm { 2 } else { random.between(1, 2) as u32 },
+            slurm,
             // A used-up budget ends a run in earnest; here the queue stays.
             queue_limit: if label_budget.is_none() && random.happens(60) { 3 } else { 1000 },
             label_budget,

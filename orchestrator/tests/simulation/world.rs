@@ -20,6 +20,7 @@ use super::planted::PlantedBug;
 use super::random::Random;
 use super::run::Run;
 use super::scenario::Scenario;
+use super::slurm::{SlurmEvent, SlurmWorld};
 use super::walker::{WalkerKey, WalkerProcess};
 
 /// The wall clock at the start, ms since 1970.
@@ -68,6 +69,7 @@ pub enum Event {
     /// A run learns that a labeller with this record has ended.
     LabellerGone(u32, String, Exit),
     CalculationEnds(String),
+    Slurm(SlurmEvent),
     Agent(AgentKey, AgentEventKind),
     /// A request of an agent arrives at the run that leads.
     AgentRequest(AgentKey, u64, Vec<u8>),
@@ -135,6 +137,7 @@ pub struct World {
     pub agents: BTreeMap<u32, AgentProcess>,
     pub labellers: BTreeMap<u32, Labeller>,
     pub calculations: BTreeMap<String, Calculation>,
+    pub slurm: SlurmWorld,
     pub known: Known,
     pub violation: Option<String>,
     /// Faults of links that last, with their end.
@@ -176,6 +179,7 @@ impl World {
             agents: BTreeMap::new(),
             labellers: BTreeMap::new(),
             calculations: BTreeMap::new(),
+            slurm: SlurmWorld::new(seed),
             known: Known::default(),
             violation: None,
             links: Vec::new(),
@@ -329,6 +333,7 @@ impl World {
             Event::LabellerHeartbeat(id) => self.labeller_heartbeat(id),
             Event::LabellerGone(id, record, exit) => self.labeller_gone(id, record, exit),
             Event::CalculationEnds(id) => self.calculation_ends(&id),
+            Event::Slurm(event) => self.slurm_event(event),
             Event::Agent(key, kind) => self.agent_acts(key, kind),
             Event::AgentRequest(key, request, bytes) => self.agent_request_arrives(key, request, bytes),
             Event::AgentHeard(id) => self.agent_heard(&id),
@@ -401,6 +406,7 @@ impl World {
                 self.at(until, Event::Resume);
             }
             Fault::KillCalculation => self.kill_calculation(),
+            Fault::Slurm(fault) => self.begin_slurm_fault(fault),
             Fault::KillAgent { agent } => self.kill_agent(agent),
             Fault::StopAgent { agent, until } => self.stop_agent(agent, until),
             Fault::MuteAgent { agent, until } => self.mute_agent(agent, until),
@@ -474,6 +480,7 @@ impl World {
 
     fn relabel(&mut self) {
         let now = self.wall_clock();
+        self.slurm.ladders.forget();
         let relabelled =
             self.store.write(self.now, ClientKind::Labeller, "new labels are requested", async |store| {
                 let labelled = store.relabellable(PROTOCOL).await?;
