@@ -45,7 +45,7 @@ const SEEDS: u64 = 64;
 /// The same with agents.
 const SEEDS_WITH_AGENTS: u64 = 24;
 /// The same with Slurm jobs.
-const SEEDS_WITH_SLURM: u64 = 16;
+const SEEDS_WITH_SLURM: u64 = 12;
 /// A planted bug must be found within this number of seeds.
 const SEEDS_TO_FIND: u64 = 1_000;
 
@@ -196,6 +196,9 @@ fn planted_bugs_are_found() {
         let seeds = first.into_iter().chain(bug.first_seed()..bug.first_seed() + SEEDS_TO_FIND);
         let found = { seeds }.find_map(|seed| Some((seed, broken_by(seed, bug)?)));
         match found {
+            Some((seed, _)) if only.is_some() => {
+                println!("{}", shrink::story_of_failure(seed, &plan(seed, &Scenario::of(seed)), Some(bug)));
+            }
             Some((seed, broken)) => println!("{bug:?}: seed {seed}: {broken}"),
             None => missed.push(bug),
         }

@@ -62,22 +62,29 @@ impl SharedFiles {
         Traces::new(found.log.0.clone(), found.log.1.saturating_sub(begun) as f64 / 1000.0)
     }
 
+    /// An invariant is broken.
+    fn fail(&mut self, what: String) {
+        self.broken.get_or_insert(what);
+    }
+
     /// A labeller has inferred an end and records it.
     pub fn record_inferred(&mut self, name: &str, end: CalculationEnd) {
         let now = self.now;
         let Some(found) = self.directories.get_mut(name) else { return };
-        if found.is_running {
-            self.broken = Some(format!("an end of calculation {name} is inferred while it runs"));
-        } else if found.end.as_ref().is_some_and(|(_, recorded, seen)| *seen <= recorded + SETTLE_TIME) {
-            self.broken = Some(format!("an end of calculation {name} is inferred, although it was recorded"));
+        let is_running = found.is_running;
+        let before = found.end.replace((end, now, now));
+        if is_running {
+            self.fail(format!("an end of calculation {name} is inferred while it runs"));
         }
-        found.end = Some((end, now, now));
+        if before.is_some_and(|(_, recorded, seen)| seen <= recorded + SETTLE_TIME) {
+            self.fail(format!("an end of calculation {name} is inferred, although it was recorded"));
+        }
     }
 
     /// A labeller submits a job that it considers not begun.
     pub fn check_not_begun(&mut self, name: &str) {
         if matches!(self.look(name), JobDirectory::Own { begun: true, .. }) {
-            self.broken = Some(format!("calculation {name} has begun and is submitted again"));
+            self.fail(format!("calculation {name} has begun and is submitted again"));
         }
     }
 
@@ -87,8 +94,7 @@ impl SharedFiles {
         let is_lost = result == Err(FailureClass::NodeFailure) && found.is_damaged;
         if found.truth != Some(result) && !is_lost {
             let truth = found.truth;
-            self.broken =
-                Some(format!("calculation {name} ended as {truth:?}, and is delivered as {result:?}"));
+            self.fail(format!("calculation {name} ended as {truth:?}, and is delivered as {result:?}"));
         }
     }
 

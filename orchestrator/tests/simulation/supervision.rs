@@ -124,15 +124,19 @@ impl World {
         self.pump(session);
     }
 
-    /// A labeller has ended; a run that started or adopted it releases its leases.
+    /// A labeller has ended; each run that started or adopted it learns of it.
     pub fn labeller_gone(&mut self, id: u32, record: String, exit: Exit) {
         let of = |run: &Run| {
             run.labeller_processes.iter().find(|(_, (of, _))| *of == id).map(|(number, _)| *number)
         };
-        let Some((session, number)) = self.runs.iter().find_map(|(session, run)| Some((*session, of(run)?)))
-        else {
-            return;
-        };
+        let runs: Vec<_> = self.runs.iter().filter_map(|(session, run)| Some((*session, of(run)?))).collect();
+        for (session, number) in runs {
+            self.run_lost_labeller(session, number, id, record.clone(), exit);
+        }
+    }
+
+    /// A labeller of a run has ended; the run releases its leases.
+    fn run_lost_labeller(&mut self, session: u64, number: u32, id: u32, record: String, exit: Exit) {
         if !self.is_active(session, || Event::LabellerGone(id, record.clone(), exit)) {
             return;
         }
