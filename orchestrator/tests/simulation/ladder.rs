@@ -57,14 +57,18 @@ impl Difficulty {
     }
 }
 
-/// The failures that a class permits before its ladder is exhausted, counted independently of the program.
-fn rungs(class: FailureClass) -> usize {
+/// The failures that a class permits before its ladder is exhausted, and what was tried then, counted independently of the
+/// program.
+fn ladder(class: FailureClass) -> (usize, &'static [RetryAdjustment]) {
+    use RetryAdjustment::*;
     match class {
-        FailureClass::NotConverged => 3,
-        FailureClass::OutOfMemory | FailureClass::Crashed => 2,
-        FailureClass::TimeLimit | FailureClass::Implausible => 1,
-        FailureClass::BadInput | FailureClass::OtherProgram => 0,
-        FailureClass::NodeFailure => usize::MAX,
+        FailureClass::NotConverged => (3, &[MoreSteps, SlowerMixing, OtherAlgorithm, OtherMoments]),
+        FailureClass::OutOfMemory => (2, &[MoreMemory, OtherNode]),
+        FailureClass::Crashed => (2, &[OtherNode]),
+        FailureClass::TimeLimit => (1, &[MoreTime]),
+        FailureClass::Implausible => (1, &[SlowerMixing, OtherMoments]),
+        FailureClass::BadInput | FailureClass::OtherProgram => (0, &[]),
+        FailureClass::NodeFailure => (usize::MAX, &[]),
     }
 }
 
@@ -106,7 +110,7 @@ impl World {
     }
 
     /// A job has failed: its ladder or its attempts are exhausted. A calculation counts once, however many attempts waited
-    /// for it.
+    /// for it, and an exhausted ladder was tried with all of its adjustments.
     pub fn check_failed_job(&mut self, job: i64) {
         if self.handled.contains(&job) {
             return;
@@ -116,6 +120,7 @@ impl World {
              FROM attempt WHERE job = {job} AND class IS NOT NULL AND outcome IN ('failed', 'lost')"
         ));
         let (mut seen, mut failed, mut classes) = (BTreeSet::new(), 0, Vec::new());
+        let mut calculated = Vec::new();
         for attempt in attempts.split(',') {
             let mut parts = attempt.split(':');
             let [class, outcome, calculation] = [(); 3].map(|()| parts.next().unwrap_or_default());
@@ -123,12 +128,22 @@ impl World {
             if calculation.is_empty() || seen.insert(calculation) {
                 failed += u32::from(outcome == "failed");
                 classes.push(class);
+                calculated.extend((!calculation.is_empty()).then_some(class));
             }
         }
-        let count = |class: FailureClass| classes.iter().filter(|name| **name == class.name()).count();
-        let is_exhausted = FailureClass::ALL.into_iter().any(|class| count(class) > rungs(class));
+        let exhausted = |names: &[&str]| {
+            let count = |class: FailureClass| names.iter().filter(|name| **name == class.name()).count();
+            FailureClass::ALL.into_iter().find(|class| count(*class) > ladder(*class).0)
+        };
+        let is_exhausted = exhausted(&classes).is_some();
         if !is_exhausted && failed < self.attempts() && !classes.contains(&"lost_too_often") {
             self.fail(format!("job {job} has failed, although something is left to try: {attempts}"));
+        }
+        // Without Slurm, calculations do not know their adjustments.
+        let tried = self.slurm.adjustments_tried(job);
+        let Some(class) = exhausted(&calculated).filter(|_| self.scenario.slurm) else { return };
+        if let Some(missing) = ladder(class).1.iter().find(|adjustment| !tried.contains(adjustment)) {
+            self.fail(format!("job {job} has failed ({class}), and {missing:?} was never tried"));
         }
     }
 }

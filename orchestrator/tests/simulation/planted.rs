@@ -145,13 +145,11 @@ impl PlantedBug {
             Self::AgentLossForgotten => AGENT_SEEDS,
             Self::LateReplyBelieved | Self::OldSlotsKept => AGENT_SEEDS + 1,
             Self::AgentIdReused => self.first_seed(),
-            Self::BegunOverlooked
-            | Self::SilenceTakenAsGone
-            | Self::FilesBelievedAtOnce
-            | Self::OldAnswerBelieved
-            | Self::EndsMixedUp
-            | Self::NodeFailuresCounted
-            | Self::LadderRestarted => SLURM_SEEDS,
+            Self::NodeFailuresCounted | Self::LadderRestarted => SLURM_SEEDS,
+            Self::BegunOverlooked | Self::EndsMixedUp => SLURM_SEEDS + 1,
+            Self::FilesBelievedAtOnce => SLURM_SEEDS + 6,
+            Self::SilenceTakenAsGone => SLURM_SEEDS + 7,
+            Self::OldAnswerBelieved => SLURM_SEEDS + 8,
         }
     }
 }

@@ -221,6 +221,13 @@ impl SlurmWorld {
         self.files.borrow_mut().remove(name);
     }
 
+    /// The adjustments of all calculations of a job of the label queue.
+    pub fn adjustments_tried(&self, job: i64) -> BTreeSet<RetryAdjustment> {
+        let files = self.files.borrow();
+        let calculations = files.directories.values().filter(|found| found.job == job);
+        calculations.flat_map(|found| found.adjustments.iter().copied()).collect()
+    }
+
     fn job(&mut self, id: u64) -> &mut BatchJob {
         &mut self.jobs[id as usize - 1]
     }
@@ -369,7 +376,8 @@ impl World {
         (found.begun, found.is_running) = (Some((now, now + delay)), true);
         found.is_damaged |= delay > SETTLE_TIME;
         let number = found.job;
-        let time = self.random.between(3_000, 15_000);
+        let longest = if self.random.happens(30) { 40_000 } else { 15_000 };
+        let time = self.random.between(3_000, longest);
         self.tell(format!("job {id} of calculation {name} begins on {node}"));
         let others = files.directories.values().filter(|other| other.job == number && other.is_running);
         if others.count() > 1 && !self.handled.contains(&number) {
