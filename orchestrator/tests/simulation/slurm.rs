@@ -235,7 +235,7 @@ impl SlurmWorld {
     /// The jobs that Slurm knows, in no order that means anything.
     fn known(&self, now: Time) -> impl Iterator<Item = &BatchJob> {
         let is_known = move |job: &&BatchJob| job.ended.is_none_or(|ended| now < ended + self.memory);
-        let newest_first = self.seed % 2 == 0;
+        let newest_first = self.seed.is_multiple_of(2);
         let number = self.jobs.len();
         let order = move |place: usize| if newest_first { number - 1 - place } else { place };
         (0..number).map(move |place| &self.jobs[order(place)]).filter(is_known)
