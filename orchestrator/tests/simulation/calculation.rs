@@ -1,5 +1,7 @@
 //! Calculations: processes of their own, which outlive the labeller that started them.
 
+use dft::FailureClass;
+
 use super::fault::Time;
 use super::random::Random;
 use super::world::{Event, World};
@@ -24,10 +26,7 @@ pub enum CalculationState {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum CalculationResult {
     Label(f64),
-    /// Of this class.
-    Failure(&'static str),
-    /// No fault of the job.
-    NodeFailure,
+    Failure(FailureClass),
 }
 
 impl CalculationResult {
@@ -38,8 +37,8 @@ impl CalculationResult {
 
     fn draw(random: &mut Random, job: i64) -> Self {
         match random.below(20) {
-            0..3 => Self::Failure("not_converged"),
-            3 => Self::NodeFailure,
+            0..3 => Self::Failure(FailureClass::NotConverged),
+            3 => Self::Failure(FailureClass::NodeFailure),
             _ => Self::Label(-job as f64 - random.below(100) as f64 / 1e3),
         }
     }

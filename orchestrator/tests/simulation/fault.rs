@@ -5,6 +5,7 @@ use std::fmt;
 
 use super::random::Random;
 use super::scenario::Scenario;
+use super::slurm::SlurmFault;
 
 /// Virtual time, ms since the start.
 pub type Time = u64;
@@ -96,6 +97,8 @@ pub enum Fault {
     },
     /// A calculation is killed, with everything that it would have computed.
     KillCalculation,
+    /// Slurm or a node fails.
+    Slurm(SlurmFault),
     /// An agent is killed, with its walkers, and started again.
     KillAgent {
         agent: u32,
@@ -269,6 +272,7 @@ impl Fault {
             | Self::MuteAgent { until, .. }
             | Self::LoseAgent { until, .. }
             | Self::PauseWalks { until } => *until,
+            Self::Slurm(fault) => fault.end(at),
             _ => at,
         }
     }
@@ -284,6 +288,10 @@ pub fn plan(seed: u64, scenario: &Scenario) -> Vec<PlannedFault> {
             let share_of_agents = if scenario.refits.is_some() { 30 } else { 60 };
             let of_agents = scenario.agents > 0 && random.happens(share_of_agents);
             let of_refits = scenario.refits.is_some() && random.happens(50);
+            if scenario.slurm && random.happens(60) {
+                let until = at + random.between(2_000, LONGEST);
+                return PlannedFault { at, fault: Fault::Slurm(SlurmFault::draw(&mut random, until)) };
+            }
             let draw = match (of_agents, of_refits) {
                 (true, _) => Fault::draw_of_agents,
                 (_, true) => Fault::draw_of_refits,
@@ -377,6 +385,7 @@ impl fmt::Display for Fault {
                 write!(f, "a person pauses all walks until {} s", seconds(until))
             }
             Self::KillCalculation => f.write_str("a calculation is killed"),
+            Self::Slurm(fault) => fmt::Display::fmt(fault, f),
             Self::KillAgent { agent } => write!(f, "agent {agent} is killed"),
             Self::StopAgent { agent, until } => write!(f, "agent {agent} hangs until {} s", seconds(until)),
             Self::MuteAgent { agent, until } => {

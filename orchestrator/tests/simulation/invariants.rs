@@ -25,7 +25,7 @@ pub struct Known {
 }
 
 /// Questions whose answer is 0, and what it means if not.
-const MUST_BE_NONE: [(&str, &str); 12] = [
+const MUST_BE_NONE: [(&str, &str); 13] = [
     ("decisions have gaps", "SELECT coalesce(max(sequence), 0) - count(*) FROM decision"),
     (
         "the version of the mixture decreases in the decision log",
@@ -67,6 +67,10 @@ const MUST_BE_NONE: [(&str, &str); 12] = [
         "jobs wait although they have a label",
         "SELECT count(*) FROM job WHERE state IN ('queued', 'leased', 'failed') AND relabel IS NULL AND EXISTS (
             SELECT 1 FROM label WHERE label.structure = job.structure AND status = 'label')",
+    ),
+    (
+        "losses of nodes count as attempts",
+        "SELECT count(*) FROM attempt WHERE outcome = 'failed' AND class = 'node_failure'",
     ),
     (
         "leases and open attempts do not match",

@@ -1,9 +1,11 @@
 //! Labellers: a stand-in that follows the rules of `workers::labeller` step by step, on the real label queue.
 
+use dft::FailureClass;
 use monitor::end_reason::is_refit_due;
 use store::records::{Label, Lease};
-use store::{CalculationRecord, CompleteOutcome, LeaseStatus, ProcessRecord, StoreError};
+use store::{CalculationRecord, CompleteOutcome, FailOutcome, LeaseStatus, ProcessRecord, StoreError};
 use wire::ContentHash;
+use workers::labeller::decisions::{attempt_limit, counts_as_attempt};
 
 use super::calculation::{CalculationResult, CalculationState};
 use super::fault::{ClientKind, Time};
@@ -17,6 +19,7 @@ pub const PROTOCOL: ContentHash = ContentHash([7; 32]);
 pub const ATTEMPTS: u32 = 3;
 /// Duration of a lease, s; it is renewed every third of it.
 const LEASE: u32 = 30;
+const RENEWAL_INTERVAL: Time = LEASE as Time * 1000 / 3;
 const HEARTBEAT_INTERVAL: Time = 15_000;
 const POLL_INTERVAL: Time = 6_000;
 /// Time between two tries of a write while the database is busy or the disk full.
@@ -47,10 +50,14 @@ enum Phase {
     Idle,
     /// Records the calculation that it will start, or has found.
     Records { lease: Box<Lease>, calculation: String, is_new: bool },
-    /// Waits for a calculation.
-    Works { lease: Box<Lease>, calculation: String, held: bool },
+    /// Waits for a calculation, or finds or prepares it.
+    Works { lease: Box<Lease>, calculation: Option<String>, held: bool },
+    /// Ends a calculation that is no longer needed.
+    Stops,
     /// Delivers the result of a calculation that has ended.
-    Delivers { lease: Box<Lease>, result: CalculationResult },
+    Delivers { lease: Box<Lease>, result: CalculationResult, calculation: Option<String> },
+    /// Removes the directory of a calculation whose result is delivered.
+    Removes { calculation: String },
     /// Gives back what it holds, and leaves its calculation to the next labeller.
     Releases,
     /// Ends in order.
@@ -90,7 +97,7 @@ impl World {
         id
     }
 
-    fn is_labeller_active(&mut self, id: u32, event: Event) -> bool {
+    pub(super) fn is_labeller_active(&mut self, id: u32, event: Event) -> bool {
         let Some(labeller) = self.labellers.get(&id) else { return false };
         let until = labeller.stopped_until;
         if until > self.now {
@@ -129,7 +136,14 @@ impl World {
                 self.labeller_records(id, lease, calculation, is_new);
             }
             Phase::Works { lease, calculation, held } => self.labeller_renews(id, lease, calculation, held),
-            Phase::Delivers { lease, result } => self.labeller_delivers(id, lease, result),
+            Phase::Delivers { lease, result, calculation } => {
+                self.labeller_delivers(id, lease, result, calculation);
+            }
+            Phase::Stops => {}
+            Phase::Removes { calculation } => {
+                self.slurm.remove_directory(&calculation);
+                self.labeller_continues(id, Phase::Idle, 0);
+            }
             Phase::Releases => self.labeller_releases(id),
             Phase::Leaves => self.labeller_leaves(id),
         }
@@ -216,6 +230,18 @@ impl World {
 
     /// Finds an earlier calculation of the job, or prepares a new one.
     fn labeller_begins_job(&mut self, id: u32, lease: Box<Lease>) {
+        let adjustments = match self.adjustments_of(&lease) {
+            Ok(adjustments) => adjustments,
+            Err(class) => {
+                let result = CalculationResult::Failure(class);
+                return self.labeller_continues(id, Phase::Delivers { lease, result, calculation: None }, 0);
+            }
+        };
+        if self.scenario.slurm {
+            let phase = Phase::Works { lease: lease.clone(), calculation: None, held: true };
+            self.labeller_continues(id, phase, RENEWAL_INTERVAL);
+            return self.begin_slurm_label(id, lease, adjustments);
+        }
         let is_useful = |calculation: &&String| {
             let state = self.calculations.get(*calculation).map(|found| found.state);
             !lease.failed_calculations.contains(calculation)
@@ -249,22 +275,20 @@ impl World {
             self.start_calculation(&calculation, lease.job);
         }
         let is_over = self.calculations[&calculation].state != CalculationState::Running;
-        let third = Time::from(LEASE) * 1000 / 3;
-        self.labeller_continues(
-            id,
-            Phase::Works { lease, calculation: calculation.clone(), held: true },
-            third,
-        );
+        let phase = Phase::Works { lease, calculation: Some(calculation.clone()), held: true };
+        self.labeller_continues(id, phase, RENEWAL_INTERVAL);
         if is_over {
             self.wake_labellers_of(&calculation);
         }
     }
 
     /// Renews a lease. If it was lost, finds out whether the result is still needed.
-    fn labeller_renews(&mut self, id: u32, lease: Box<Lease>, calculation: String, mut held: bool) {
+    fn labeller_renews(&mut self, id: u32, lease: Box<Lease>, calculation: Option<String>, mut held: bool) {
         let (now, wall) = (self.now, self.wall_clock());
-        if self.labellers[&id].stop {
+        let stop = self.labellers[&id].stop;
+        if let Some(calculation) = calculation.as_ref().filter(|_| stop) {
             self.tell(format!("labeller process {id} leaves calculation {calculation} running"));
+            self.slurm.drop_task(id);
             return self.labeller_continues(id, Phase::Releases, 0);
         }
         if held {
@@ -283,43 +307,96 @@ impl World {
             }
         }
         let _ = self.state_leases(id, &[&lease]);
-        if !held {
+        if let Some(own) = calculation.as_ref().filter(|_| !held) {
             match self.store.read(now, async |store| store.lease_status(&lease).await) {
                 Ok(LeaseStatus::Over) => {
-                    self.remove_calculation(&calculation);
                     self.tell(format!("labeller process {id} stops: the result is no longer needed"));
-                    return self.labeller_continues(id, Phase::Idle, 0);
+                    return self.labeller_stops_calculation(id, own.clone());
                 }
-                Ok(LeaseStatus::LeasedAgain { calculation: Some(other) }) if other == calculation => {
+                Ok(LeaseStatus::LeasedAgain { calculation: Some(other) }) if other == *own => {
+                    self.slurm.drop_task(id);
                     return self.labeller_continues(id, Phase::Idle, 0);
                 }
                 _ => {}
             }
         }
-        let third = Time::from(LEASE) * 1000 / 3;
-        self.labeller_continues(id, Phase::Works { lease, calculation, held }, third);
+        // It leaves as soon as it has a calculation.
+        let pause = if stop { RETRY_INTERVAL } else { RENEWAL_INTERVAL };
+        self.labeller_continues(id, Phase::Works { lease, calculation, held }, pause);
+    }
+
+    /// Ends a calculation that is no longer needed.
+    fn labeller_stops_calculation(&mut self, id: u32, calculation: String) {
+        if !self.scenario.slurm {
+            self.remove_calculation(&calculation);
+            return self.labeller_continues(id, Phase::Idle, 0);
+        }
+        self.labeller_continues(id, Phase::Stops, 0);
+        self.begin_slurm_stop(id, calculation);
+    }
+
+    /// The lease on which a labeller works.
+    pub fn lease_of(&self, id: u32) -> Option<Box<Lease>> {
+        match &self.labellers.get(&id)?.phase {
+            Phase::Works { lease, .. } => Some(lease.clone()),
+            _ => None,
+        }
+    }
+
+    /// A labeller has found or prepared the calculation for which it waits.
+    pub fn labeller_takes(&mut self, id: u32, taken: String) {
+        if let Some(Labeller { phase: Phase::Works { calculation, .. }, .. }) = self.labellers.get_mut(&id) {
+            *calculation = Some(taken);
+        }
+    }
+
+    /// A labeller has the result of its job.
+    pub fn labeller_has_result(&mut self, id: u32, result: CalculationResult, calculation: Option<String>) {
+        let Some(lease) = self.lease_of(id) else { return };
+        let delay = self.random.between(5, 500);
+        self.labeller_continues(id, Phase::Delivers { lease, result, calculation }, delay);
+    }
+
+    pub fn labeller_is_idle(&mut self, id: u32) {
+        self.labeller_continues(id, Phase::Idle, 0);
+    }
+
+    /// A labeller cannot go on, whatever the job.
+    pub fn labeller_fails(&mut self, id: u32) {
+        let (holder, wall) = (self.labellers[&id].record.id.clone(), self.wall_clock());
+        // Otherwise the leases of a dead process are released.
+        let _ = self.store.write(self.now, ClientKind::Labeller, "leases are released", async |store| {
+            store.release_all(&holder, wall).await
+        });
+        self.labeller_exits(id, Exit::Failed);
     }
 
     /// A calculation has ended: who waits for it delivers its result.
     pub fn wake_labellers_of(&mut self, ended: &str) {
         let waits = |labeller: &Labeller| match &labeller.phase {
-            Phase::Works { lease, calculation, .. } if calculation == ended => Some(lease.clone()),
+            Phase::Works { lease, calculation: Some(own), .. } if own == ended => Some(lease.clone()),
             _ => None,
         };
         let waiting: Vec<_> =
             self.labellers.iter().filter_map(|(id, labeller)| Some((*id, waits(labeller)?))).collect();
         let calculation = &self.calculations[ended];
         let result = match calculation.state {
-            CalculationState::Gone => CalculationResult::NodeFailure,
+            CalculationState::Gone => CalculationResult::Failure(FailureClass::NodeFailure),
             _ => calculation.result,
         };
         for (id, lease) in waiting {
             let delay = self.random.between(5, 500);
-            self.labeller_continues(id, Phase::Delivers { lease, result }, delay);
+            self.labeller_continues(id, Phase::Delivers { lease, result, calculation: None }, delay);
         }
     }
 
-    fn labeller_delivers(&mut self, id: u32, lease: Box<Lease>, result: CalculationResult) {
+    fn labeller_delivers(
+        &mut self,
+        id: u32,
+        lease: Box<Lease>,
+        result: CalculationResult,
+        calculation: Option<String>,
+    ) {
         let (now, wall, client) = (self.now, self.wall_clock(), ClientKind::Labeller);
         let delivered = match result {
             CalculationResult::Label(energy) => {
@@ -334,24 +411,29 @@ impl World {
                 })
             }
             CalculationResult::Failure(class) => {
-                let outcome = self.store.write(now, client, "a failure", async |store| {
-                    store.fail(&lease, class, "log", ATTEMPTS, wall).await
+                let limit = attempt_limit(&lease.failures, class, self.attempts());
+                let counts = counts_as_attempt(class) || self.bug == Some(PlantedBug::NodeFailuresCounted);
+                let outcome = self.store.write(now, client, "a failure", async |store| match counts {
+                    true => store.fail(&lease, class.name(), "log", limit, wall).await,
+                    false => store.release_lost(&lease, class.name(), "log", wall).await,
                 });
+                if let Ok(FailOutcome::Failed) = outcome {
+                    self.check_failed_job(lease.job);
+                }
                 outcome.map(|outcome| format!("{class}, {outcome:?}"))
-            }
-            CalculationResult::NodeFailure => {
-                let outcome = self.store.write(now, client, "a lost calculation", async |store| {
-                    store.release_lost(&lease, "node_failure", "log", wall).await
-                });
-                outcome.map(|outcome| format!("node failure, {outcome:?}"))
             }
         };
         match delivered {
             Ok(what) => {
                 self.tell(format!("labeller process {id} delivers job {}: {what}", lease.job));
-                self.labeller_continues(id, Phase::Idle, 0);
+                match calculation {
+                    Some(calculation) => self.labeller_continues(id, Phase::Removes { calculation }, 200),
+                    None => self.labeller_continues(id, Phase::Idle, 0),
+                }
             }
-            Err(error) => self.labeller_retries(id, Phase::Delivers { lease, result }, &error),
+            Err(error) => {
+                self.labeller_retries(id, Phase::Delivers { lease, result, calculation }, &error);
+            }
         }
     }
 
@@ -434,6 +516,7 @@ impl World {
     /// The process of a labeller ends; its calculations continue.
     pub fn labeller_exits(&mut self, id: u32, exit: Exit) {
         let Some(labeller) = self.labellers.remove(&id) else { return };
+        self.slurm.drop_task(id);
         self.tell(format!("labeller {} (process {id}) has ended: {exit:?}", labeller.number));
         self.process_is_dead(&labeller.record.id);
         self.after(1, Event::LabellerGone(id, labeller.record.id, exit));

@@ -13,6 +13,7 @@ mod fault;
 mod faulty_store;
 mod invariants;
 mod labeller;
+mod ladder;
 mod planted;
 mod random;
 mod reactor_shell;
@@ -21,6 +22,9 @@ mod refitter;
 mod run;
 mod scenario;
 mod shrink;
+mod slurm;
+mod slurm_files;
+mod slurm_labeller;
 mod supervision;
 mod versions;
 mod walker;
@@ -35,7 +39,7 @@ use tempfile::TempDir;
 
 use self::fault::{PlannedFault, plan};
 use self::planted::PlantedBug;
-use self::scenario::{AGENT_SEEDS, REFIT_SEEDS, SEED_STRUCTURES, Scenario};
+use self::scenario::{AGENT_SEEDS, REFIT_SEEDS, SEED_STRUCTURES, SLURM_SEEDS, Scenario};
 use self::world::{Outcome, World};
 use crate::common::{CAMPAIGN, seed_structure};
 
@@ -45,6 +49,8 @@ const SEEDS: u64 = 64;
 const SEEDS_WITH_AGENTS: u64 = 24;
 /// The same with refits.
 const SEEDS_WITH_REFITS: u64 = 8;
+/// The same with Slurm jobs.
+const SEEDS_WITH_SLURM: u64 = 12;
 /// A planted bug must be found within this number of seeds.
 const SEEDS_TO_FIND: u64 = 1_000;
 
@@ -157,6 +163,12 @@ fn no_seed_with_agents_breaks_an_invariant() {
 #[test]
 fn no_seed_with_refits_breaks_an_invariant() {
     check_seeds(REFIT_SEEDS..REFIT_SEEDS + number_in("CALMWALK_SEEDS").unwrap_or(SEEDS_WITH_REFITS));
+}
+
+/// The same with calculations as Slurm jobs, and with jobs of different difficulty.
+#[test]
+fn no_seed_with_slurm_breaks_an_invariant() {
+    check_seeds(SLURM_SEEDS..SLURM_SEEDS + number_in("CALMWALK_SEEDS").unwrap_or(SEEDS_WITH_SLURM));
 }
 
 fn check_seeds(seeds: std::ops::Range<u64>) {

@@ -1,7 +1,7 @@
 //! Mistakes that are made on purpose, to see that the simulation finds them. They are made at the edges, never in the
 //! program itself.
 
-use super::scenario::{AGENT_SEEDS, REFIT_SEEDS};
+use super::scenario::{AGENT_SEEDS, REFIT_SEEDS, SLURM_SEEDS};
 
 /// A mistake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -62,10 +62,24 @@ pub enum PlantedBug {
     RefitAbandoned,
     /// A version that was refused is taken up.
     RefusedVersionTakenUp,
+    /// A labeller does not see whether a Slurm job has begun.
+    BegunOverlooked,
+    /// A labeller takes a Slurm that does not answer for one that knows no job.
+    SilenceTakenAsGone,
+    /// A labeller does not wait until files of nodes are visible.
+    FilesBelievedAtOnce,
+    /// A labeller judges a calculation by an answer of Slurm from before it began.
+    OldAnswerBelieved,
+    /// A labeller does not read why Slurm ended a job.
+    EndsMixedUp,
+    /// The loss of a node counts as an attempt.
+    NodeFailuresCounted,
+    /// Each attempt begins with the first adjustments again.
+    LadderRestarted,
 }
 
 impl PlantedBug {
-    pub const ALL: [Self; 28] = [
+    pub const ALL: [Self; 35] = [
         Self::AnswerBeforeCommit,
         Self::FailedCommitBelieved,
         Self::CommitRepeated,
@@ -94,6 +108,13 @@ impl PlantedBug {
         Self::OldWalksContinue,
         Self::RefitAbandoned,
         Self::RefusedVersionTakenUp,
+        Self::BegunOverlooked,
+        Self::SilenceTakenAsGone,
+        Self::FilesBelievedAtOnce,
+        Self::OldAnswerBelieved,
+        Self::EndsMixedUp,
+        Self::NodeFailuresCounted,
+        Self::LadderRestarted,
     ];
 }
 
@@ -109,6 +130,13 @@ impl PlantedBug {
             | Self::OldWalksContinue
             | Self::RefitAbandoned
             | Self::RefusedVersionTakenUp => REFIT_SEEDS,
+            Self::BegunOverlooked
+            | Self::SilenceTakenAsGone
+            | Self::FilesBelievedAtOnce
+            | Self::OldAnswerBelieved
+            | Self::EndsMixedUp
+            | Self::NodeFailuresCounted
+            | Self::LadderRestarted => SLURM_SEEDS,
             _ => 0,
         }
     }
@@ -140,6 +168,11 @@ impl PlantedBug {
             Self::VersionLimitForgotten | Self::VersionRecordedTwice | Self::OldWalksContinue => {
                 REFIT_SEEDS + 1
             }
+            Self::NodeFailuresCounted | Self::LadderRestarted => SLURM_SEEDS,
+            Self::BegunOverlooked | Self::EndsMixedUp => SLURM_SEEDS + 1,
+            Self::FilesBelievedAtOnce => SLURM_SEEDS + 6,
+            Self::SilenceTakenAsGone => SLURM_SEEDS + 7,
+            Self::OldAnswerBelieved => SLURM_SEEDS + 8,
         }
     }
 }

@@ -16,6 +16,8 @@ pub const SCENARIOS: u64 = 8;
 pub const AGENT_SEEDS: u64 = 1 << 32;
 /// Seeds from this one on have refits of the potential.
 pub const REFIT_SEEDS: u64 = 1 << 33;
+/// Seeds from this one on label in Slurm jobs, and their jobs are of different difficulty.
+pub const SLURM_SEEDS: u64 = 1 << 34;
 /// Number of seed structures.
 pub const SEED_STRUCTURES: usize = 3;
 
@@ -29,6 +31,8 @@ pub struct Scenario {
     /// Agents on other hosts, each with two walkers and an assignment in reserve.
     pub agents: u32,
     pub labellers: u32,
+    /// Calculations are Slurm jobs.
+    pub slurm: bool,
     /// Walkers wait while more label jobs are unfinished.
     pub queue_limit: u64,
     /// Number of labels that the campaign may make.
@@ -72,11 +76,15 @@ impl RefitPlan {
 impl Scenario {
     /// The scenario of a seed.
     pub fn of(seed: u64) -> Self {
-        let has_refits = seed >= REFIT_SEEDS;
-        let number = seed % SCENARIOS
-            + [0, AGENT_SEEDS, REFIT_SEEDS].into_iter().rfind(|first| seed >= *first).unwrap();
+        let (has_refits, slurm) = ((REFIT_SEEDS..SLURM_SEEDS).contains(&seed), seed >= SLURM_SEEDS);
+        let first =
+            [0, AGENT_SEEDS, REFIT_SEEDS, SLURM_SEEDS].into_iter().rfind(|first| seed >= *first).unwrap();
+        let number = seed % SCENARIOS + first;
         // With refits, a file and a server have agents, in live and in reproducible mode.
-        let has_agents = if has_refits { [3, 4].contains(&(seed % SCENARIOS)) } else { seed >= AGENT_SEEDS };
+        let has_agents = match has_refits {
+            true => [3, 4].contains(&(seed % SCENARIOS)),
+            false => seed >= AGENT_SEEDS && !slurm,
+        };
         let mut random = Random::new(1000 + number);
         let mode = if number.is_multiple_of(2) { CampaignMode::Reproducible } else { CampaignMode::Live };
         let settings = SelectorSettings {
@@ -92,7 +100,8 @@ impl Scenario {
             scripts: (0..SEED_STRUCTURES).map(|_| script(&mut random)).collect(),
             walkers: if has_agents { 1 } else { random.between(2, 4) as u32 },
             agents: if has_agents { 2 } else { 0 },
-            labellers: random.between(1, 2) as u32,
+            labellers: if slurm { 2 } else { random.between(1, 2) as u32 },
+            slurm,
             // A used-up budget ends a run in earnest; here the queue stays.
             queue_limit: if label_budget.is_none() && random.happens(60) { 3 } else { 1000 },
             label_budget,

@@ -4,7 +4,6 @@ use orchestrator::supervisor::{ChildState, SupervisorAction};
 use store::ProcessRecord;
 
 use super::fault::{ClientKind, Time};
-use super::labeller::ATTEMPTS;
 use super::planted::PlantedBug;
 use super::run::Run;
 use super::walker::WalkerKey;
@@ -147,12 +146,13 @@ impl World {
         run.labeller_processes.remove(&number);
         let Some(ended) = run.labellers.ended(number, exit.reason(), elapsed) else { return };
         if ended.reason.is_crash() {
+            let attempts = self.attempts();
             // If that fails, the leases of dead processes are released with the next heartbeat.
             let _ = self.store.write(
                 now,
                 ClientKind::Orchestrator,
                 "leases of a crashed labeller",
-                async |store| store.fail_leases_of(&record, "crashed", "", ATTEMPTS, wall).await,
+                async |store| store.fail_leases_of(&record, "crashed", "", attempts, wall).await,
             );
         }
         let _ = self.store.write(now, ClientKind::Orchestrator, "leases of dead processes", async |store| {

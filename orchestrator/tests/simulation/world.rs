@@ -22,6 +22,7 @@ use super::refit::RefitEvent;
 use super::refitter::RefitProcesses;
 use super::run::Run;
 use super::scenario::Scenario;
+use super::slurm::{SlurmEvent, SlurmWorld};
 use super::walker::{WalkerKey, WalkerProcess};
 
 /// The wall clock at the start, ms since 1970.
@@ -70,6 +71,7 @@ pub enum Event {
     /// A run learns that a labeller with this record has ended.
     LabellerGone(u32, String, Exit),
     CalculationEnds(String),
+    Slurm(SlurmEvent),
     Agent(AgentKey, AgentEventKind),
     /// A request of an agent arrives at the run that leads.
     AgentRequest(AgentKey, u64, Vec<u8>),
@@ -139,6 +141,7 @@ pub struct World {
     pub labellers: BTreeMap<u32, Labeller>,
     pub calculations: BTreeMap<String, Calculation>,
     pub refits: RefitProcesses,
+    pub slurm: SlurmWorld,
     pub known: Known,
     pub violation: Option<String>,
     /// Faults of links that last, with their end.
@@ -185,6 +188,7 @@ impl World {
             labellers: BTreeMap::new(),
             calculations: BTreeMap::new(),
             refits: RefitProcesses::default(),
+            slurm: SlurmWorld::new(seed),
             known: Known::default(),
             violation: None,
             links: Vec::new(),
@@ -341,6 +345,7 @@ impl World {
             Event::LabellerHeartbeat(id) => self.labeller_heartbeat(id),
             Event::LabellerGone(id, record, exit) => self.labeller_gone(id, record, exit),
             Event::CalculationEnds(id) => self.calculation_ends(&id),
+            Event::Slurm(event) => self.slurm_event(event),
             Event::Agent(key, kind) => self.agent_acts(key, kind),
             Event::AgentRequest(key, request, bytes) => self.agent_request_arrives(key, request, bytes),
             Event::AgentHeard(id) => self.agent_heard(&id),
@@ -414,6 +419,7 @@ impl World {
                 self.at(until, Event::Resume);
             }
             Fault::KillCalculation => self.kill_calculation(),
+            Fault::Slurm(fault) => self.begin_slurm_fault(fault),
             Fault::KillAgent { agent } => self.kill_agent(agent),
             Fault::StopAgent { agent, until } => self.stop_agent(agent, until),
             Fault::MuteAgent { agent, until } => self.mute_agent(agent, until),
@@ -498,6 +504,7 @@ impl World {
 
     fn relabel(&mut self) {
         let now = self.wall_clock();
+        self.slurm.ladders.forget();
         let relabelled =
             self.store.write(self.now, ClientKind::Labeller, "new labels are requested", async |store| {
                 let labelled = store.relabellable(PROTOCOL).await?;

@@ -93,7 +93,8 @@ impl RunnerCommand {
 
 /// How a calculation ended.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct CalculationEnd {
+pub struct CalculationEnd {
+    /// By what.
     pub how: EndReason,
     /// The program, as the command names it.
     pub program: PathBuf,
@@ -111,7 +112,7 @@ pub(super) struct CalculationEnd {
 
 /// See [`CalculationEnd`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) enum EndReason {
+pub enum EndReason {
     /// By itself, or at a limit.
     Ended(#[serde(with = "ExitOnFile")] Exit),
     /// The program does not exist or cannot be executed: the error number of the system.
@@ -130,13 +131,18 @@ enum ExitOnFile {
 }
 
 impl CalculationEnd {
+    /// Whether the program could not be started.
+    pub fn is_not_started(&self) -> bool {
+        matches!(self.how, EndReason::NotStarted(_))
+    }
+
     /// Reads the end that a runner left in the directory, if the calculation has ended.
-    pub fn read(directory: &Path) -> Option<Self> {
+    pub(super) fn read(directory: &Path) -> Option<Self> {
         serde_json::from_slice(&result_file::read(&directory.join(END)).ok()?).ok()
     }
 
     /// The file appears as a whole, and only when everything else is done.
-    pub fn write(&self, directory: &Path) -> io::Result<()> {
+    pub(super) fn write(&self, directory: &Path) -> io::Result<()> {
         let (unfinished, finished) = (directory.join(format!("{END}.new")), directory.join(END));
         // The program may have left anything under these names.
         remove_existing(&unfinished)?;

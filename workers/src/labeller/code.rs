@@ -19,13 +19,14 @@ use super::blocking::blocking;
 use super::calculation_handle::CalculationHandle;
 use super::calculation_request::{CalculationNote, CalculationRequest};
 use super::calculation_runner::{Calculation, CalculationEnd, EndReason, WORK};
-use super::calculation_state::CalculationState;
+use super::calculation_state::{CalculationState, EarlierStep};
 use super::custom_jobs::CustomJob;
 use super::failure_classes::failure_classes;
 use super::file_error::file_error;
 use super::label_attempt::{EndedCalculation, LabelAttempt, SingleLabel};
 use super::local;
 use super::prepare::{PreparedInput, prepare, read, write};
+use super::retry_decision::next_adjustments;
 use super::scratch::{self, ScratchRoot};
 use super::slurm;
 use super::{BatchSystem, ExecutionSettings, RunnerCommand, log, private_directory, retry_until_written};
@@ -183,10 +184,7 @@ impl CodeMethod {
         structure: Structure,
         failures: Vec<FailureClass>,
     ) -> Result<PreparedInput, Failure> {
-        let Some(remedies) = dft::adjustments(&failures) else {
-            let class = failures.last().copied().unwrap_or(FailureClass::Crashed);
-            return Err(class.with_message("there is nothing left to try"));
-        };
+        let remedies = next_adjustments(&failures)?;
         let (code, execution) = (Arc::clone(&self.code), self.execution.clone());
         blocking(move || prepare(&*code, &execution, &structure, &remedies)).await
     }
@@ -226,14 +224,11 @@ impl CodeMethod {
         let once: Vec<_> = known.filter(|handle| named.insert(handle.directory().to_owned())).collect();
         let mut found = None;
         for handle in once {
-            match handle.inspect(&self.batch).await? {
-                CalculationState::Elsewhere => {}
-                CalculationState::Ended(CalculationEnd { how: EndReason::NotStarted(_), .. })
-                | CalculationState::Gone => {
-                    handle.clear(&self.batch).await?;
-                }
-                look if found.is_none() => found = Some((handle, look)),
-                _ => handle.clear(&self.batch).await?,
+            let state = handle.inspect(&self.batch).await?;
+            match state.of_earlier(found.is_some()) {
+                EarlierStep::Leave => {}
+                EarlierStep::Clear => handle.clear(&self.batch).await?,
+                EarlierStep::Take => found = Some((handle, state)),
             }
         }
         Ok(found)

@@ -3,6 +3,6 @@
 use dft::FailureClass;
 
 /// The classes of failures with these names.
-pub(super) fn failure_classes(names: &[String]) -> Vec<FailureClass> {
+pub fn failure_classes(names: &[String]) -> Vec<FailureClass> {
     names.iter().filter_map(|name| FailureClass::from_name(name)).collect()
 }

@@ -11,8 +11,8 @@ use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
 use super::code::CodeMethod;
-use super::failure_classes::failure_classes;
 use super::label_attempt::{EndedCalculation, LabelAttempt};
+use super::retry_decision::attempt_limit;
 use super::{ExecutionSettings, ReferenceMethod, RunnerCommand};
 
 /// A way to make labels.
@@ -129,15 +129,12 @@ impl Method {
         }
     }
 
-    /// Whether no retry adjustment is left after this failure.
-    pub(super) fn has_no_remedy(&self, lease: &Lease, failure: &Failure) -> bool {
+    /// The number of attempts after which a job fails that has failed like this, at most `attempts`.
+    pub(super) fn attempt_limit(&self, lease: &Lease, failure: &Failure, attempts: u32) -> u32 {
         match self {
             // Every attempt would give the same result.
-            Self::Reference(_) => false,
-            Self::Code(_) => {
-                let failures = failure_classes(&lease.failures).into_iter().chain([failure.class]);
-                dft::adjustments(&failures.collect::<Vec<_>>()).is_none()
-            }
+            Self::Reference(_) => attempts,
+            Self::Code(_) => attempt_limit(&lease.failures, failure.class, attempts),
         }
     }
 }

@@ -33,6 +33,7 @@ mod reference;
 mod remove_tree;
 mod report_line;
 mod retry;
+mod retry_decision;
 mod scratch;
 mod shutdown;
 mod single_label;
@@ -42,7 +43,7 @@ mod validate;
 use std::pin::pin;
 use std::time::{Duration, Instant};
 
-use dft::{CalculationResults, Failure, FailureClass};
+use dft::{CalculationResults, Failure};
 use store::records::{Label, LabelDetails, Lease, Protocol};
 use store::{LeaseStatus, Store, StoreError};
 use tokio_util::sync::CancellationToken;
@@ -51,6 +52,7 @@ use tracing::{debug, info, warn};
 use energies::Offsets;
 use label_attempt::{EndedCalculation, LabelAttempt};
 use report_line::DeliveryOutcome;
+use retry_decision::counts_as_attempt;
 
 pub use calculation_runner::{RunnerCommand, run_calculation};
 pub use code::CodeMethod;
@@ -67,6 +69,18 @@ pub use retry::retry_until_written;
 pub use shutdown::Shutdown;
 pub use single_label::label_structure;
 pub use validate::LabelBounds;
+
+/// What labellers decide, apart from what they read, write and run.
+pub mod decisions {
+    pub use super::calculation_runner::{CalculationEnd, EndReason};
+    pub use super::calculation_state::{CalculationState, EarlierStep, WaitStep};
+    pub use super::failure_classes::failure_classes;
+    pub use super::retry_decision::{attempt_limit, counts_as_attempt, failure_at, next_adjustments};
+    pub use super::slurm::{
+        Inspection, InspectionStep, JobDirectory, SqueueJob, SubmissionRetry, SubmissionStep, Traces,
+        infer_end, is_listed, jobs_to_cancel,
+    };
+}
 
 /// Time between two heartbeats in the store, for every process that sends them.
 pub const HEARTBEAT_INTERVAL: Duration = Duration::from_secs(5);
@@ -271,8 +285,10 @@ async fn deliver_attempt(
         retry_until_written(stop, || store.record_cost(lease, ended.core_seconds, log)).await?;
     }
     // A failure without a retry adjustment is not tried again.
-    let no_remedy = validated.as_ref().is_err_and(|failure| method.has_no_remedy(lease, failure));
-    let attempts = if no_remedy { 1 } else { settings.attempts };
+    let attempts = match &validated {
+        Ok(_) => settings.attempts,
+        Err(failure) => method.attempt_limit(lease, failure, settings.attempts),
+    };
     let outcome =
         retry_until_written(stop, || deliver(store, lease, &validated, log, attempts, now())).await?;
     Ok(Delivered { validated, outcome, ended })
@@ -430,10 +446,9 @@ async fn deliver(
     };
     let (class, text) = (failure.class.name(), format!("{failure}\n{log}"));
     let text = text.trim_end();
-    let failed = match failure.class {
-        // This was no fault of the job.
-        FailureClass::NodeFailure => store.release_lost(lease, class, text, now).await,
-        _ => store.fail(lease, class, text, attempts, now).await,
+    let failed = match counts_as_attempt(failure.class) {
+        true => store.fail(lease, class, text, attempts, now).await,
+        false => store.release_lost(lease, class, text, now).await,
     };
     failed.map(DeliveryOutcome::Failed)
 }

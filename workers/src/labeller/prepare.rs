@@ -13,6 +13,7 @@ use super::ExecutionSettings;
 use super::calculation_runner::WORK;
 use super::file_error::file_error;
 use super::input_diff::input_diff;
+use super::retry_decision::failure_at;
 
 /// Beside [`WORK`]: input files that all calculations share.
 pub(super) const DATA: &str = "data";
@@ -110,10 +111,7 @@ pub(super) fn read(
     work: &Path,
     exit: Exit,
 ) -> Result<CalculationResults, Failure> {
-    code.read(structure, work, exit).map_err(|failure| match exit {
-        Exit::TimeLimit | Exit::OutOfMemory | Exit::LostNode => exit.failure(),
-        Exit::Code(_) | Exit::Signal(_) => failure,
-    })
+    code.read(structure, work, exit).map_err(|failure| failure_at(exit, failure))
 }
 
 #[cfg(test)]

@@ -26,7 +26,7 @@ use super::batch_job::{
     SCRATCH_NOT_SHARED, own_user, settle,
 };
 use super::calculation_runner::{Calculation, CalculationEnd};
-use super::calculation_state::CalculationState;
+use super::calculation_state::{CalculationState, WaitStep};
 use super::file_error::file_error;
 use super::private_directory;
 use job::{JobSubmission, MAX_SUBMISSIONS};
@@ -170,11 +170,11 @@ impl CustomJobs {
                 return Ok(Some(end));
             }
             if asked.elapsed() >= QUESTION_INTERVAL {
-                match self.inspect(job).await? {
-                    CalculationState::Ended(end) => return Ok(Some(end)),
-                    CalculationState::Ready => self.submit(job).await?,
-                    CalculationState::Running => {}
-                    CalculationState::Gone | CalculationState::Elsewhere => return Ok(None),
+                match self.inspect(job).await?.while_waiting() {
+                    WaitStep::Read(end) => return Ok(Some(end)),
+                    WaitStep::Submit => self.submit(job).await?,
+                    WaitStep::Wait => {}
+                    WaitStep::Abandon => return Ok(None),
                 }
                 asked = Instant::now();
             }

@@ -10,10 +10,12 @@
 //! forgets finished ones after a while (`MinJobAge`): a job that it does not know is finished, and the job's log
 //! gives the reason if Slurm ended it.
 
+mod inspection;
 mod job;
 mod script;
 mod squeue;
 mod squeue_cache;
+mod submission;
 
 use std::ffi::OsStr;
 use std::io;
@@ -21,7 +23,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use ::batch::{JobPhase, SlurmClient, SlurmError};
+use ::batch::{SlurmClient, SlurmError};
 use dft::PassedEnvironment;
 use store::StoreError;
 use tokio::sync::OnceCell;
@@ -29,20 +31,20 @@ use tokio::time::sleep;
 use tracing::{info, warn};
 
 use super::batch_job::{
-    CANCEL_TIMEOUT, COMMAND_TIMEOUT, MAX_POLL_INTERVAL, MAX_REFUSALS, MIN_POLL_INTERVAL, RETRY_INTERVAL,
-    SCRATCH_NOT_SHARED, own_user, settle,
+    CANCEL_TIMEOUT, COMMAND_TIMEOUT, MAX_POLL_INTERVAL, MIN_POLL_INTERVAL, RETRY_INTERVAL, own_user, settle,
 };
 use super::calculation_runner::CalculationEnd;
-use super::calculation_state::CalculationState;
+use super::calculation_state::{CalculationState, WaitStep};
 use super::file_error::file_error;
-use super::private_directory;
-use job::BEGUN;
-use squeue::{SqueueJob, Traces};
 use squeue_cache::SQUEUE_INTERVAL;
 
+pub use inspection::{Inspection, InspectionStep, JobDirectory};
 pub(super) use job::CalculationJob;
 pub(super) use script::{JobRequirements, runner, write};
+pub use squeue::{SqueueJob, Traces, infer_end, jobs_to_cancel};
+pub use squeue_cache::is_listed;
 pub(super) use squeue_cache::remove_cache;
+pub use submission::{SubmissionRetry, SubmissionStep};
 
 /// Access to Slurm for calculations.
 pub(super) struct Slurm {
@@ -83,7 +85,7 @@ impl Slurm {
     /// Submits a job that Slurm does not know. Waits while Slurm accepts no further job. If the reply is lost, looks for
     /// the job. If Slurm responds but refuses the job, the labeller fails, not the calculation.
     pub async fn submit(&self, job: &CalculationJob) -> Result<(), StoreError> {
-        let mut refused = 0;
+        let mut submission = SubmissionRetry::default();
         loop {
             let on_full = |full: &SlurmError| {
                 if !self.is_full.swap(true, Ordering::Relaxed) {
@@ -95,72 +97,49 @@ impl Slurm {
                 info!("Slurm accepts jobs again");
             }
             let Err(error) = submitted else { return Ok(()) };
-            if !self.jobs(job).await?.is_empty() {
-                return Ok(());
+            let (jobs, exists) = (self.jobs(job).await?, job.directory.is_dir());
+            let permit = || script::clear_excluded_nodes(&job.directory);
+            let step = submission.failed(&jobs, exists, permit);
+            match step.map_err(|error| file_error(&job.directory, error))? {
+                SubmissionStep::Wait => return Ok(()),
+                SubmissionStep::Again => sleep(RETRY_INTERVAL).await,
+                SubmissionStep::Refused => {
+                    return Err(job_error(job, format_args!("cannot submit its job: {error}")));
+                }
             }
-            refused += 1;
-            // All allowed nodes may be excluded.
-            let again = script::clear_excluded_nodes(&job.directory)
-                .map_err(|error| file_error(&job.directory, error))?;
-            if refused >= MAX_REFUSALS && !again {
-                return Err(job_error(job, format_args!("cannot submit its job: {error}")));
-            }
-            sleep(RETRY_INTERVAL).await;
         }
     }
 
     pub async fn inspect(&self, job: &CalculationJob) -> Result<CalculationState, StoreError> {
-        if job.directory.symlink_metadata().is_ok() && !private_directory::is_own(&job.directory) {
-            // Another user has created a directory of that name after it was removed, or has submitted the job.
-            return Ok(CalculationState::Elsewhere);
-        }
-        if let Some(end) = CalculationEnd::read(&job.directory) {
-            return Ok(CalculationState::Ended(end));
-        }
-        let others = job.user.is_some_and(|user| user != own_user());
-        if others || self.cluster(&job.directory).await? != job.cluster {
-            return Ok(CalculationState::Elsewhere);
-        }
-        let jobs = self.jobs(job).await?;
-        let lives = jobs.iter().any(|reported| reported.phase() != JobPhase::Over);
-        match (lives, job.directory.is_dir()) {
-            (true, true) => Ok(CalculationState::Running),
-            (true, false) => Err(job_error(
-                job,
-                format_args!(
-                    "job '{}' is running there, but its directory is not visible here: {SCRATCH_NOT_SHARED}",
-                    job.name
-                ),
-            )),
-            (false, false) => Ok(CalculationState::Gone),
-            (false, true) => self.finished_job(job, &jobs).await,
+        let mut inspection = Inspection::default();
+        let mut step = inspection.looked(JobDirectory::look(&job.directory));
+        loop {
+            step = match step {
+                InspectionStep::Ask => {
+                    if self.is_elsewhere(job).await? {
+                        return Ok(CalculationState::Elsewhere);
+                    }
+                    inspection.answered(self.jobs(job).await?)
+                }
+                InspectionStep::Settle => {
+                    settle(&job.directory).await;
+                    inspection.looked(JobDirectory::look(&job.directory))
+                }
+                InspectionStep::InferEnd(reported) => {
+                    let end = infer_end(reported.as_ref(), &Traces::read(&job.directory));
+                    end.write(&job.directory).map_err(|error| file_error(&job.directory, error))?;
+                    return Ok(CalculationState::Ended(end));
+                }
+                InspectionStep::Is(state) => return Ok(state),
+                InspectionStep::NotVisible(why) => return Err(job_error(job, why)),
+            };
         }
     }
 
-    /// The state of a job that is finished or unknown to Slurm.
-    async fn finished_job(
-        &self,
-        job: &CalculationJob,
-        jobs: &[SqueueJob],
-    ) -> Result<CalculationState, StoreError> {
-        settle(&job.directory).await;
-        if let Some(end) = CalculationEnd::read(&job.directory) {
-            return Ok(CalculationState::Ended(end));
-        }
-        let begun = job.directory.join(BEGUN).is_dir();
-        let reported = squeue::most_informative(jobs);
-        match reported {
-            None if !begun => return Ok(CalculationState::Ready),
-            Some(reported) if !begun && reported.ran_to_its_end() => {
-                let message = format!("{reported}, but its files are not visible here: {SCRATCH_NOT_SHARED}");
-                return Err(job_error(job, message));
-            }
-            _ => {}
-        }
-        // Slurm forgets it after a while.
-        let end = squeue::infer_end(reported, &Traces::read(&job.directory));
-        end.write(&job.directory).map_err(|error| file_error(&job.directory, error))?;
-        Ok(CalculationState::Ended(end))
+    /// Whether Slurm does not show the job here: it is another user's, or on another cluster.
+    async fn is_elsewhere(&self, job: &CalculationJob) -> Result<bool, StoreError> {
+        let others = job.user.is_some_and(|user| user != own_user());
+        Ok(others || self.cluster(&job.directory).await? != job.cluster)
     }
 
     /// Waits for the end, and submits the job if Slurm does not know it; `None` if its directory was removed.
@@ -172,11 +151,11 @@ impl Slurm {
             }
             if asked.elapsed() >= SQUEUE_INTERVAL {
                 if !squeue_cache::is_alive(&self.commands, job).await {
-                    match self.inspect(job).await? {
-                        CalculationState::Ended(end) => return Ok(Some(end)),
-                        CalculationState::Ready => self.submit(job).await?,
-                        CalculationState::Running => {}
-                        CalculationState::Gone | CalculationState::Elsewhere => return Ok(None),
+                    match self.inspect(job).await?.while_waiting() {
+                        WaitStep::Read(end) => return Ok(Some(end)),
+                        WaitStep::Submit => self.submit(job).await?,
+                        WaitStep::Wait => {}
+                        WaitStep::Abandon => return Ok(None),
                     }
                 }
                 asked = Instant::now();
@@ -192,16 +171,8 @@ impl Slurm {
         let started = Instant::now();
         loop {
             let jobs = self.ask(job).await.map_err(|error| job_error(job, error))?;
-            let living = jobs.iter().filter(|reported| reported.phase() != JobPhase::Over);
-            // What ends was reported so before.
-            let ids: Vec<_> = living
-                .filter(|reported| reported.phase() != JobPhase::Completing)
-                .map(|reported| reported.id.clone())
-                .collect();
-            self.commands.cancel(&ids).await.map_err(|error| job_error(job, error))?;
-            if jobs.iter().all(|reported| reported.phase() == JobPhase::Over)
-                || started.elapsed() > CANCEL_TIMEOUT
-            {
+            self.commands.cancel(&jobs_to_cancel(&jobs)).await.map_err(|error| job_error(job, error))?;
+            if jobs.iter().all(SqueueJob::is_over) || started.elapsed() > CANCEL_TIMEOUT {
                 return Ok(());
             }
             sleep(MIN_POLL_INTERVAL * 4).await;
@@ -222,8 +193,7 @@ impl Slurm {
     async fn ask(&self, job: &CalculationJob) -> Result<Vec<SqueueJob>, SlurmError> {
         let name = format!("--name={}", job.name);
         let text = self.commands.queue(SqueueJob::FORMAT, &["--states=all", &name]).await?;
-        let jobs: Vec<_> = text.lines().map(SqueueJob::parse).collect::<Result<_, _>>()?;
-        Ok(jobs.into_iter().filter(|reported| !reported.was_refused()).collect())
+        SqueueJob::parse_all(&text)
     }
 
     async fn cluster(&self, directory: &Path) -> Result<&str, StoreError> {

@@ -13,7 +13,8 @@ use super::job::{BEGUN, LOG};
 
 /// A job, as `squeue` shows it.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct SqueueJob {
+pub struct SqueueJob {
+    /// Its number.
     pub id: JobId,
     /// State in Slurm's terms, such as `RUNNING`.
     state: String,
@@ -29,7 +30,16 @@ impl SqueueJob {
     /// The format for `squeue`.
     pub const FORMAT: &str = "%i|%T|%N|%M|%r";
 
-    pub fn parse(line: &str) -> Result<Self, SlurmError> {
+    /// The jobs in an answer. Records of rejected `sbatch` calls are no jobs.
+    ///
+    /// # Errors
+    /// [`SlurmError::UnexpectedOutput`]
+    pub fn parse_all(text: &str) -> Result<Vec<Self>, SlurmError> {
+        let jobs: Vec<_> = text.lines().map(Self::parse).collect::<Result<_, _>>()?;
+        Ok(jobs.into_iter().filter(|reported| !reported.was_refused()).collect())
+    }
+
+    pub(super) fn parse(line: &str) -> Result<Self, SlurmError> {
         let unreadable = || SlurmError::UnexpectedOutput {
             program: "squeue",
             found: line.to_owned(),
@@ -46,17 +56,22 @@ impl SqueueJob {
         })
     }
 
-    pub fn phase(&self) -> JobPhase {
+    pub(super) fn phase(&self) -> JobPhase {
         JobPhase::from_state(&self.state)
     }
 
+    /// Whether it has ended.
+    pub fn is_over(&self) -> bool {
+        self.phase() == JobPhase::Over
+    }
+
     /// Whether its script ended by itself.
-    pub fn ran_to_its_end(&self) -> bool {
+    pub(super) fn ran_to_its_end(&self) -> bool {
         matches!(self.state.as_str(), "COMPLETED" | "FAILED")
     }
 
     /// Whether this is only the record of a rejected `sbatch` call: such a job never existed.
-    pub fn was_refused(&self) -> bool {
+    fn was_refused(&self) -> bool {
         self.state == "FAILED" && self.nodes.is_empty()
     }
 
@@ -98,9 +113,16 @@ pub(super) fn most_informative(jobs: &[SqueueJob]) -> Option<&SqueueJob> {
     said_more.or_else(|| jobs.first())
 }
 
+/// The jobs to cancel, of those with the same name. What ends already is left alone.
+pub fn jobs_to_cancel(jobs: &[SqueueJob]) -> Vec<JobId> {
+    let living =
+        jobs.iter().filter(|reported| !matches!(reported.phase(), JobPhase::Over | JobPhase::Completing));
+    living.map(|reported| reported.id.clone()).collect()
+}
+
 /// What a job left in its directory.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Traces {
+pub struct Traces {
     /// The end of Slurm's log, which gives the reason if Slurm ended the job.
     log: String,
     /// Time from its start to the last entry of the log, s.
@@ -108,7 +130,12 @@ pub(super) struct Traces {
 }
 
 impl Traces {
-    pub fn read(directory: &Path) -> Self {
+    /// The end of a log, and the time from the job's start to the last entry of it, s.
+    pub fn new(log: String, seconds: f64) -> Self {
+        Self { log, seconds }
+    }
+
+    pub(super) fn read(directory: &Path) -> Self {
         let log = directory.join(LOG);
         let changed = |path: &Path| fs::metadata(path).and_then(|file| file.modified()).ok();
         let times = changed(&directory.join(BEGUN)).zip(changed(&log));
@@ -132,7 +159,7 @@ impl Traces {
 }
 
 /// Infers how a calculation ended whose job is over or unknown to Slurm and whose runner recorded no end.
-pub(super) fn infer_end(reported: Option<&SqueueJob>, traces: &Traces) -> CalculationEnd {
+pub fn infer_end(reported: Option<&SqueueJob>, traces: &Traces) -> CalculationEnd {
     let mut remark = match reported {
         Some(reported) => format!("Slurm reports: {reported}; its runner did not record an end"),
         None => "Slurm no longer knows its job, and its runner did not record an end".to_owned(),

@@ -27,10 +27,16 @@ pub(super) async fn is_alive(commands: &SlurmClient, job: &CalculationJob) -> bo
                 write_cache(&path, &names);
                 names
             }
-            Err(error) => return !error.is_missing(),
+            Err(error) => return !error.is_missing() && is_listed(None, &job.name),
         },
     };
-    names.lines().any(|name| name == job.name)
+    is_listed(Some(&names), &job.name)
+}
+
+/// Whether the job of that name counts as alive by Slurm's list of the unfinished ones, one name a line; `None` if Slurm does
+/// not answer: then nothing is concluded.
+pub fn is_listed(names: Option<&str>, job: &str) -> bool {
+    names.is_none_or(|names| names.lines().any(|name| name == job))
 }
 
 /// Removes the cache from the directory of a campaign's calculations.
