@@ -32,7 +32,7 @@ pub enum CalculationResult {
 impl CalculationResult {
     /// The same for each calculation of a job, in campaigns in which versions of the potential follow from labels.
     fn of_job(job: i64) -> Self {
-        if job % 6 == 4 { Self::Failure("not_converged") } else { Self::Label(-job as f64) }
+        if job % 6 == 4 { Self::Failure(FailureClass::NotConverged) } else { Self::Label(-job as f64) }
     }
 
     fn draw(random: &mut Random, job: i64) -> Self {
