@@ -53,7 +53,7 @@ export function show(content, _, signal) {
 
 function tile(title, value, ...more) {
   return element("div", { class: "tile" }, element("span", { class: "title" }, title), element("strong", {}, value),
-    ...more.map((line) => element("span", {}, line)));
+    ...more.filter(Boolean).map((line) => element("span", {}, line)));
 }
 
 function summary(status) {
