@@ -42,7 +42,7 @@ export function table(caption, columns, rows) {
 }
 
 /** A title may wrap, but its part in parentheses does not. */
-function titleOf(title) {
+export function titleOf(title) {
   return title.split(/(\([^)]*\))/).map((part) => (part.startsWith("(") ? element("span", { class: "whole" }, part) : part));
 }
 

@@ -105,15 +105,16 @@ function grid(across, up, [width, height], left) {
   return drawing("g", { class: "grid" },
     across.ticks.map((value) => [
       drawing("path", { d: `M${across.at(value)} ${TOP}V${height - BOTTOM}` }),
-      label(across.text(value), across.at(value), width, height - BOTTOM + 14)]).flat(),
+      label(across.text(value), across.at(value), left, width, height - BOTTOM + 14)]).flat(),
     up.ticks.map((value) => [
       drawing("path", { d: `M${left} ${up.at(value)}H${width - RIGHT}` }),
       drawing("text", { x: left - 6, y: up.at(value) + 3.5, "text-anchor": "end" }, up.text(value))]).flat());
 }
 
-/** The number of a tick of the horizontal axis, moved to the left where it would be cut off. */
-function label(text, x, width, y) {
-  return drawing("text", { x: Math.min(x, width - 1 - (CHARACTER * text.length) / 2), y, "text-anchor": "middle" }, text);
+/** The number of a tick of the horizontal axis, moved where it would be cut off or would touch a number of the vertical axis. */
+function label(text, x, left, width, y) {
+  const half = (CHARACTER * text.length) / 2;
+  return drawing("text", { x: Math.max(left - 4 + half, Math.min(x, width - 1 - half)), y, "text-anchor": "middle" }, text);
 }
 
 function titles(x, y, [width, height], left) {
