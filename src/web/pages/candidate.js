@@ -153,7 +153,7 @@ function trace(found, grades, signal) {
 }
 
 function covered({ by, later, searched_until: until }) {
-  const list = (named) => element("ul", {}, named.slice(0, 50).map((one) => element("li", {}, link(one))));
+  const list = (named) => element("ul", { class: "many" }, named.slice(0, 50).map((one) => element("li", {}, link(one))));
   const more = (named) => (named.length > 50 ? element("p", { class: "quiet" }, `… and ${whole(named.length - 50)} more`) : "");
   const parts = [];
   if (by.length > 0) parts.push(section("Covered by updates of", list(by), more(by)));
