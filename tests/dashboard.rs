@@ -158,6 +158,15 @@ fn check_table(live: &Live) {
     let expected = |line: &&Value| line["gamma"].as_f64() > Some(1.1) && line["origin"] == "biased";
     assert_eq!(found, all.iter().filter(expected).cloned().collect::<Vec<_>>());
     assert_eq!(all_lines(address, "where=energy+%3C+1", 4), Vec::<Value>::new(), "there is no label");
+    for fate in ["", "&fate=accepted"] {
+        let found = all_lines(address, &format!("where=walk+%3D+0+and+gamma+%3E+1{fate}"), 2);
+        let expected = all.iter().filter(|line| {
+            line["walk"] == 0
+                && line["gamma"].as_f64() > Some(1.0)
+                && (fate.is_empty() || line["fate"] == "accepted")
+        });
+        assert!(found.len() > 1 && found.iter().eq(expected), "{fate}: {}", found.len());
+    }
     let file = get(address, "/api/candidates.extxyz?state=queued&ascending=true");
     let frames: Vec<_> = ExtxyzReader::new(file.body.as_bytes()).map(|frame| frame.unwrap()).collect();
     let waiting = all_lines(address, "state=queued&ascending=true", 50);

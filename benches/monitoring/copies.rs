@@ -19,9 +19,11 @@ const BEFORE_SPECIES: usize = 75;
 /// Flag in the count before uncompressed numbers (`store/src/numbers.rs`).
 const PLAIN: u64 = 1 << 63;
 
-/// `copy`: the columns that differ between accepted candidates.
-const ONE: [&str; 2] = [
+/// `pool`: features of several candidates. `copy`: the columns that differ between accepted candidates.
+const ONE: [&str; 3] = [
     "CREATE TEMP TABLE one AS SELECT * FROM candidate WHERE fate = 'accepted' AND origin = 'biased' ORDER BY decision DESC LIMIT 1",
+    "CREATE TEMP TABLE pool AS SELECT row_number() OVER (ORDER BY decision) - 1 AS place, features
+        FROM candidate JOIN candidate_data USING (decision) WHERE features IS NOT NULL AND atoms = (SELECT atoms FROM one)",
     "CREATE TEMP TABLE copy (i INTEGER PRIMARY KEY, hash BLOB, data BLOB, forces BLOB, grades BLOB, id TEXT, block BLOB)",
 ];
 
@@ -44,8 +46,9 @@ const MORE: [&str; 12] = [
         seed_structure, 'biased', CASE WHEN is_accepted THEN 'accepted' ELSE 'declined' END, new.reason, mixture_version, atoms,
         formula, temperature, 1 + 0.4 * x, energy, walker_gamma, walker_gamma_nbr, walker_above, selector_gamma,
         selector_gamma_nbr, selector_above, 1 + 2 * x, original_gamma_nbr, original_above, NULL, NULL, NULL, NULL FROM new CROSS JOIN one",
-    "INSERT INTO candidate_data SELECT new.decision, copy.block, features, selector_grades, grades FROM new JOIN copy USING (i)
-        CROSS JOIN (SELECT * FROM candidate_data WHERE decision = (SELECT decision FROM one))",
+    "INSERT INTO candidate_data SELECT new.decision, copy.block, pool.features, selector_grades, grades FROM new JOIN copy USING (i)
+        JOIN pool ON place = i / 20 % (SELECT count(*) FROM pool)
+        CROSS JOIN (SELECT selector_grades FROM candidate_data WHERE decision = (SELECT decision FROM one))",
     "INSERT INTO candidate_count SELECT 'biased', coalesce(reason, 'accepted'), count(*) FROM new GROUP BY 2
         ON CONFLICT (origin, fate) DO UPDATE SET number = number + excluded.number",
     "INSERT INTO job (structure, protocol, decision, state, priority, attempts)

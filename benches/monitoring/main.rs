@@ -23,11 +23,18 @@ const TRIES: usize = 11;
 const LISTENERS: usize = 20;
 const LISTENING: Duration = Duration::from_secs(60);
 
+/// Columns without an index: numbers of the candidate, of its label, and errors against the label.
+const COLUMNS: [&str; 4] = ["walk", "seed_structure", "energy", "force_mae"];
+/// Selects fewer structures than a file may have; all accepted candidates are searched for them.
+const SELECTION: &str = "/api/candidates.extxyz?fate=accepted&where=gamma+%3E+2.93";
+/// Tries of what takes long.
+const FEW_TRIES: usize = 3;
+
 const PAGES: [&str; 8] = [
     "/",
     "/api/candidates?limit=50",
     "/api/candidates?limit=50&order=gamma",
-    "/api/candidates?limit=50&order=volume&ascending=true",
+    "/api/candidates?limit=50&order=relative_volume&ascending=true",
     "/api/candidates?limit=50&fate=too_close",
     "/api/candidates?limit=50&order=queue&state=queued",
     "/api/candidates?limit=50&where=gamma+%3E+2.9",
@@ -69,6 +76,24 @@ fn main() {
     let newest = page.pointer("/candidates/0/id").and_then(serde_json::Value::as_str).expect("a candidate");
     let details = format!("/api/candidates/{newest}");
     row("one candidate", || fetch(&details));
+    row("a walk's candidates", || fetch("/api/walks/17/candidates"));
+    println!("\nmemory of the server: {}", memory(server.0.id()));
+    for column in COLUMNS {
+        few(&format!("the table by `{column}`"), || {
+            fetch(&format!("/api/candidates?limit=50&order={column}"))
+        });
+    }
+    few("`where=walk = 17`", || fetch("/api/candidates?limit=50&where=walk+%3D+17"));
+    few("a file of a selection", || fetch(SELECTION));
+    println!("\nmemory of the server: {}", memory(server.0.id()));
+    let begun = Instant::now();
+    let map = get_computed(address, "/api/map");
+    println!(
+        "map of {} and {} after {:.1} s",
+        map["accepted"],
+        map["control"],
+        begun.elapsed().as_secs_f64()
+    );
     println!("\nmemory of the server: {}", memory(server.0.id()));
     let begun = Instant::now();
     row("force errors, before they are there", || fetch("/api/errors"));
@@ -93,15 +118,23 @@ fn main() {
     drop(listeners);
 }
 
-fn row(name: &str, mut act: impl FnMut()) {
+fn row(name: &str, act: impl FnMut()) {
+    times(name, TRIES, act);
+}
+
+fn few(name: &str, act: impl FnMut()) {
+    times(name, FEW_TRIES, act);
+}
+
+fn times(name: &str, tries: usize, mut act: impl FnMut()) {
     let time = |_| {
         let begun = Instant::now();
         act();
         begun.elapsed().as_secs_f64() * 1000.0
     };
-    let mut times: Vec<f64> = (0..TRIES).map(time).collect();
+    let mut times: Vec<f64> = (0..tries).map(time).collect();
     times.sort_by(f64::total_cmp);
-    println!("| {name} | {:.0} ms | {:.0} ms |", times[TRIES / 2], times[TRIES - 1]);
+    println!("| {name} | {:.0} ms | {:.0} ms |", times[tries / 2], times[tries - 1]);
 }
 
 /// Processor time of a process and its threads so far.

@@ -5,7 +5,7 @@ use std::collections::btree_map::Entry;
 
 use atoms::cell::{norm, sub};
 use serde::Serialize;
-use store::{ExportCursor, ExportFilter, ExportRow, ExportSource, Store, StoreError};
+use store::{ExportCursor, ExportRow, ExportSource, Store, StoreError};
 use wire::ContentHash;
 
 use crate::energy_errors::ProtocolEnergyOffsets;
@@ -24,7 +24,10 @@ pub struct CandidateErrors {
     pub stress: Option<f64>,
 }
 
-/// Reads errors one by one, and keeps what all have in common.
+/// Candidates whose labels are in memory at a time.
+const PAGE: usize = 32;
+
+/// Reads errors of single candidates, and keeps what all have in common.
 #[derive(Debug)]
 pub struct ErrorReader {
     /// `None` without a label protocol.
@@ -40,25 +43,42 @@ impl ErrorReader {
         Ok(Self { protocol, offsets: BTreeMap::new() })
     }
 
-    /// The errors of the candidate of a decision, whose walk has `version` of the potential; `None` without a label.
+    /// The errors of candidates, each given by its decision and the version of the potential of its walk; `None` without a label.
     pub async fn read(
         &mut self,
         store: &Store,
-        decision: i64,
-        version: u32,
-    ) -> Result<Option<CandidateErrors>, StoreError> {
-        let Some(protocol) = self.protocol else { return Ok(None) };
-        let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
-        let before = Some(ExportCursor::Candidate(decision - 1));
-        let found = store.labelled(&filter, before, 1).await?.pop();
-        let Some(row) = found.filter(|row| row.cursor == ExportCursor::Candidate(decision)) else {
-            return Ok(None);
-        };
-        let offsets = match self.offsets.entry(version) {
-            Entry::Occupied(known) => known.into_mut(),
-            Entry::Vacant(place) => place.insert(ProtocolEnergyOffsets::fit(store, protocol, version).await?),
-        };
-        Ok(errors(&row, offsets))
+        candidates: &[(i64, u32)],
+    ) -> Result<Vec<Option<CandidateErrors>>, StoreError> {
+        let mut found = BTreeMap::new();
+        if let Some(protocol) = self.protocol {
+            for page in candidates.chunks(PAGE) {
+                self.read_page(store, protocol, page, &mut found).await?;
+            }
+        }
+        Ok(candidates.iter().map(|(decision, _)| found.get(decision).copied()).collect())
+    }
+
+    async fn read_page(
+        &mut self,
+        store: &Store,
+        protocol: ContentHash,
+        page: &[(i64, u32)],
+        found: &mut BTreeMap<i64, CandidateErrors>,
+    ) -> Result<(), StoreError> {
+        let decisions: Vec<_> = page.iter().map(|(decision, _)| *decision).collect();
+        let versions: BTreeMap<_, _> = page.iter().copied().collect();
+        for row in store.labelled_candidates(protocol, &decisions).await? {
+            let ExportCursor::Candidate(decision) = row.cursor else { continue };
+            let version = versions.get(&decision).copied().unwrap_or_default();
+            let offsets = match self.offsets.entry(version) {
+                Entry::Occupied(known) => known.into_mut(),
+                Entry::Vacant(place) => {
+                    place.insert(ProtocolEnergyOffsets::fit(store, protocol, version).await?)
+                }
+            };
+            found.extend(errors(&row, offsets).map(|errors| (decision, errors)));
+        }
+        Ok(())
     }
 }
 

@@ -134,6 +134,18 @@ impl StructureFilter {
 }
 
 impl StructureFilter {
+    /// The walk that all structures are from that pass the filter; `None` if it allows several.
+    pub fn only_walk(&self) -> Option<u32> {
+        match self {
+            Self::Number(NumberField::Walk, ComparisonOperator::Equal, number) => {
+                let walk = *number as u32;
+                (f64::from(walk) == *number).then_some(walk)
+            }
+            Self::And(left, right) => left.only_walk().or_else(|| right.only_walk()),
+            _ => None,
+        }
+    }
+
     /// The property names in the expression, in order.
     pub fn names(&self) -> Vec<&'static str> {
         match self {

@@ -59,6 +59,23 @@ fn filters_are_evaluated() {
     }
 }
 
+#[test]
+fn a_filter_may_allow_a_single_walk() {
+    for (text, walk) in [
+        ("walk = 17", Some(17)),
+        ("gamma > 2 and (step < 100 and walk = 3)", Some(3)),
+        ("walk = 3 or walk = 3", None),
+        ("not walk = 3", None),
+        ("walk >= 3", None),
+        ("step = 3", None),
+        ("walk = 1.5", None),
+        ("walk = -1", None),
+        ("walk = 1e12", None),
+    ] {
+        assert_eq!(text.parse::<StructureFilter>().unwrap().only_walk(), walk, "{text}");
+    }
+}
+
 /// Whether the text contains the word, not as a part of another word.
 fn has_word(text: &str, word: &str) -> bool {
     text.split(|c: char| !c.is_ascii_alphanumeric() && c != '_').any(|found| found == word)

@@ -81,7 +81,7 @@ pub use processes::{ProcessRecord, this_host};
 pub use recent::{DecidedCandidate, RecentDecision};
 pub use records::*;
 pub use relabel::{NewProtocol, RelabelCounts, RelabelRequest, Relabellable};
-pub use report::{CollectedStructure, FateCount};
+pub use report::{CollectedFeatures, CollectedStructure, DecisionSample, FateCount};
 pub use running_labels::RunningLabel;
 pub use status::{CampaignStatus, Candidates, Declined, LabelJobCounts, WalkStatus};
 pub use store::Store;

@@ -14,6 +14,22 @@ use crate::common::http::{get, said};
 use crate::common::processes::wait_until;
 use crate::common::{Running, program, succeed};
 
+/// Texts of plots that are cut off or that cover another.
+const UNREADABLE: &str = "return [...document.querySelectorAll('figure svg')].flatMap((svg) => {
+    const [box, name] = [svg.getBoundingClientRect(), svg.closest('figure').querySelector('figcaption').textContent];
+    const texts = [...svg.querySelectorAll('text')].map((text) => [text.textContent, text.getBoundingClientRect()]);
+    const cut = texts.filter(([, at]) => at.left < box.left - 1 || at.right > box.right + 1 || at.bottom > box.bottom + 1);
+    const covered = texts.flatMap(([text, a], k) => texts.slice(k + 1).filter(([, b]) =>
+        Math.min(a.right, b.right) - Math.max(a.left, b.left) > 1 && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 3)
+        .map(([other]) => `${name}: ${text} and ${other}`));
+    return [...cut.map(([text]) => `${name}: ${text}`), ...covered];
+})";
+
+/// Checks that the texts of all plots can be read.
+fn plots_are_readable(browser: &Browser, page: &str) {
+    assert_eq!(browser.run(UNREADABLE), Value::Array(Vec::new()), "{page}");
+}
+
 /// Saves a screenshot for people to check.
 fn picture(browser: &Browser, name: &str) {
     let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/dashboard");
@@ -54,6 +70,7 @@ fn every_page_shows_what_it_should_and_nothing_comes_from_elsewhere() {
         browser.wait("document.querySelectorAll('.tile').length === 5");
         browser.wait("document.querySelectorAll('figure svg[role=img]').length >= 3");
         same_time(&browser);
+        plots_are_readable(&browser, "overview");
         assert_eq!(browser.run("return location.hash"), "", "the token is out of the address");
         browser.wait("document.body.textContent.includes('<b>vacancy</b>')");
         picture(&browser, &format!("overview-{colours}.png"));
@@ -102,6 +119,7 @@ fn nothing_is_cut_off_and_errors_are_shown_by_grade() {
             browser.widen(width);
             browser.show(&format!("{page}#errors"));
             errors(&browser);
+            plots_are_readable(&browser, "errors");
             is_not_cut(&browser, ".scrolls");
             picture(&browser, &format!("errors-{colours}-{width}.png"));
             browser.show(&format!("{page}#candidate/{id}"));
@@ -190,6 +208,7 @@ fn fits(browser: &Browser, url: &str, is_there: &str) {
         "{url}: {width} of {shown}: {}",
         browser.run(&format!("return {wide}"))
     );
+    plots_are_readable(browser, url);
 }
 
 fn errors(browser: &Browser) {

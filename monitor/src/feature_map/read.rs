@@ -6,16 +6,18 @@ use std::sync::Arc;
 use analysis::SystematicSample;
 use atoms::Species;
 use atoms::cell::{norm, sub};
-use store::{Store, StoreError, StoredCandidate};
-use wire::{ContentHash, Origin};
+use store::{CollectedFeatures, Store, StoreError};
+use wire::Origin;
 
 use super::plane::{FeaturePoint, NumberedComponent, plane};
 use super::{FeatureSpaceMap, MAX_ELEMENTS, MapPlane, MapPoint, MappedStructure, ShownPart};
 use crate::mixture_status::InitialMixture;
 
-/// Largest number of accepted candidates, and of frames of control walks, that are read.
-const MAX_ACCEPTED: usize = 1000;
-const MAX_CONTROL: usize = 500;
+/// Numbers of accepted candidates, and of frames of control walks, that are read if there are more.
+const ACCEPTED_SAMPLE: u32 = 1000;
+const CONTROL_SAMPLE: u32 = 500;
+/// Candidates whose features are in memory at a time.
+const PAGE: usize = 32;
 /// Largest number of atoms of each element from which the axes follow.
 const MAX_ATOMS: usize = 2048;
 
@@ -45,16 +47,14 @@ pub async fn read(store: &Store) -> Result<MapSample, StoreError> {
         MapSample { version: (!versions.is_single()).then_some(version), ..MapSample::default() };
     let mut parts = [ShownPart::default(); 2];
     for ((origin, room), part) in
-        [(Origin::Biased, MAX_ACCEPTED), (Origin::Control, MAX_CONTROL)].into_iter().zip(&mut parts)
+        [(Origin::Biased, ACCEPTED_SAMPLE), (Origin::Control, CONTROL_SAMPLE)].into_iter().zip(&mut parts)
     {
-        let decisions = store.collected_decisions(origin, versions.walks_of(version)).await?;
-        let mut chosen = SystematicSample::new(room);
-        decisions.into_iter().for_each(|decision| chosen.add(decision));
+        let chosen = store.sampled_decisions(origin, versions.walks_of(version), room).await?;
         let before = sample.structures.len();
-        for decision in chosen.items() {
-            sample.read(store, *decision, protocol).await?;
+        for page in chosen.decisions.chunks(PAGE) {
+            store.collected_features(protocol, page).await?.iter().for_each(|found| sample.add(found));
         }
-        *part = ShownPart { all: chosen.total(), shown: (sample.structures.len() - before) as u64 };
+        *part = ShownPart { all: chosen.total, shown: (sample.structures.len() - before) as u64 };
     }
     [sample.accepted, sample.control] = parts;
     Ok(sample)
@@ -68,26 +68,8 @@ impl MapSample {
         FeatureSpaceMap { version, dimension, accepted, control, structures, planes }
     }
 
-    /// Adds the candidate of a decision, if the store has its features.
-    async fn read(
-        &mut self,
-        store: &Store,
-        decision: i64,
-        protocol: Option<ContentHash>,
-    ) -> Result<(), StoreError> {
-        let found = store.candidates(decision - 1, true, 1).await?.pop();
-        let Some(found) = found.filter(|found| found.decision == decision) else { return Ok(()) };
-        let label = match protocol {
-            Some(_) => store.collected(protocol, decision - 1, 1).await?.pop(),
-            None => None,
-        };
-        let forces = label.filter(|row| row.decision == decision).and_then(|row| row.label_forces);
-        self.add(&found, forces.as_deref());
-        Ok(())
-    }
-
-    /// `label`: forces of its label, eV/Å.
-    fn add(&mut self, found: &StoredCandidate, label: Option<&[[f64; 3]]>) {
+    /// Adds a candidate, if the store has its features.
+    fn add(&mut self, found: &CollectedFeatures) {
         let view = found.block.view();
         let species = view.structure().species;
         let Some(features) = found.features.as_deref() else { return };
@@ -113,7 +95,7 @@ impl MapSample {
                 continue;
             };
             let error = |atom: &usize| {
-                let (model, label) = (view.forces.get(*atom)?, label?.get(*atom)?);
+                let (model, label) = (view.forces.get(*atom)?, found.label_forces.as_ref()?.get(*atom)?);
                 Some(norm(sub(*model, *label)) as f32)
             };
             let current = atoms.iter().map(|atom| value(&found.selector.gamma, *atom));

@@ -102,4 +102,32 @@ mod tests {
             assert!(!elsewhere.contains("http://") && !elsewhere.contains("https://"), "{name}");
         }
     }
+
+    /// Relative luminance of a colour `#rrggbb` (WCAG 2.2).
+    fn luminance(colour: &str) -> f64 {
+        let channel = |place: usize| {
+            let value = f64::from(u8::from_str_radix(&colour[place..place + 2], 16).unwrap()) / 255.0;
+            if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
+        };
+        0.2126 * channel(1) + 0.7152 * channel(3) + 0.0722 * channel(5)
+    }
+
+    /// WCAG 2.2, 1.4.11: graphics have a contrast of at least 3.
+    #[test]
+    fn lines_and_marks_stand_out_on_light_and_dark_paper() {
+        let text = FILES.iter().find(|(name, _)| *name == "colours.js").unwrap().1;
+        let colours: Vec<_> =
+            text.match_indices("\"#").map(|(place, _)| &text[place + 1..place + 8]).collect();
+        assert!(colours.len() > 12, "{colours:?}");
+        for paper in ["#ffffff", "#18212a"] {
+            let of_paper = luminance(paper);
+            for colour in &colours {
+                let of_line = luminance(colour);
+                let contrast = (of_line.max(of_paper) + 0.05) / (of_line.min(of_paper) + 0.05);
+                assert!(contrast >= 3.0, "{colour} on {paper}: {contrast:.2}");
+            }
+        }
+        let style = FILES.iter().find(|(name, _)| *name == "style.css").unwrap().1;
+        assert!(style.contains("--paper: #fff;") && style.contains("--paper: #18212a;"));
+    }
 }

@@ -65,12 +65,23 @@ function about({ structure, found, file, frame, same_structure: same, same_impor
     ["version of the potential", found?.version > 0 && whole(found.version)],
     ["energy of the potential", found && `${decimals(found.energy / atoms, 4, "eV")} per atom`],
     ["control of", found?.control_of != null && element("span", {}, `walk ${found.control_of}`, found.partner && [": ", link(found.partner)])],
-    ["shortest distance", near?.shortest && `${decimals(near.shortest, 3, "Å")} (atoms ${near.atoms.join(" and ")})` +
-      near.pairs.map(({ pair, limit }) => limit == null ? "" : `; the selector's guard requires ${decimals(limit, 3, "Å")} of ${pair}`).join("")],
+    ["shortest distance", near?.shortest && `${decimals(near.shortest, 3, "Å")} (atoms ${near.atoms.join(" and ")})${required(near.pairs)}`],
     ["imported from", file && `${file}, frame ${frame}`],
     ["same structure", (same.length > 0 || imported) && element("span", {}, same.map((named) => [link(named), " "]).flat(),
       imported && element("a", { href: `#candidate/import-${imported}` }, `import-${imported}`))],
   ]);
+}
+
+/** What the selector's guard requires, with the pairs that have the same limit together. */
+function required(pairs) {
+  const limits = new Map();
+  for (const { pair, limit } of pairs) {
+    if (limit == null) continue;
+    const text = decimals(limit, 3, "Å");
+    limits.set(text, [...(limits.get(text) ?? []), pair]);
+  }
+  const parts = [...limits].map(([limit, of]) => `${limit} of ${of.length > 1 && of.length === pairs.length ? "every pair of elements" : of.join(", ")}`);
+  return parts.length === 0 ? "" : `; the selector's guard requires ${parts.join("; ")}`;
 }
 
 function link({ candidate, decision }) {
@@ -104,14 +115,23 @@ function decided(decision) {
     ["mixture afterwards", `version ${whole(decision.mixture_version)}`],
     ["update", update && `${update.covariance_update ?? ""} with α = ${digits(update.alpha)}; ${ENDS[update.ended_by]}`],
     ["γ_max afterwards", update && decimals(update.gamma_max_after, 3)],
-    ["components changed", update && update.components.map(([index, component], k) =>
-      `${component} of ${update.component_elements[k] ?? `element ${index} of the model`}`).join(", ")],
+    ["components changed", update && changed(update)],
     ["training atoms with γ > 1", update?.training_frames && percent(update.training_frames.share_above_one)],
   ]);
   if (!update || update.trials.length === 0) return list;
   const columns = [["α", true], ["γ_max", true], ["atoms above", true]];
   return element("div", {}, list, table("Trials of α", columns,
     update.trials.map((trial) => [digits(trial.alpha), decimals(trial.gamma_max, 3), whole(trial.above)])));
+}
+
+/** The numbers of the changed components of each element. */
+function changed({ components, component_elements: elements }) {
+  const numbers = new Map();
+  components.forEach(([index, component], k) => {
+    const name = elements[k] ?? `element ${index} of the model`;
+    numbers.set(name, [...(numbers.get(name) ?? []), component]);
+  });
+  return [...numbers].map(([name, of]) => `${name} ${of.join(", ")}`).join("; ");
 }
 
 /** Earlier candidates of the walk. The store knows the walk's γ only at its candidates. */
@@ -124,7 +144,7 @@ function trace(found, grades, signal) {
       points: before.filter((one) => one[key] != null).map((one) => [one.step, one[key], `#candidate/${encodeURIComponent(one.id)}`,
         `step ${one.step}: ${words(one.fate)}`]) });
     place.replaceChildren(plot({ title: `Walk ${found.walk}, segment ${found.segment}: earlier candidates`,
-      x: { title: "step" }, y: { title: "γ_max, γ₀_max", least: 0 },
+      x: { title: "step", ticks: whole }, y: { title: "γ_max, γ₀_max", least: 0 },
       lines: [{ colour: LINES[0], points: points("gamma") }, { colour: LINES[1], dash: DASHES[1], points: points("walker_gamma") }],
       marks: [marks("gamma", "circle", 0), marks("walker_gamma", "diamond", 1)] }));
   };
@@ -133,7 +153,7 @@ function trace(found, grades, signal) {
 }
 
 function covered({ by, later, searched_until: until }) {
-  const list = (named) => element("ul", {}, named.slice(0, 50).map((one) => element("li", {}, link(one))));
+  const list = (named) => element("ul", { class: "many" }, named.slice(0, 50).map((one) => element("li", {}, link(one))));
   const more = (named) => (named.length > 50 ? element("p", { class: "quiet" }, `… and ${whole(named.length - 50)} more`) : "");
   const parts = [];
   if (by.length > 0) parts.push(section("Covered by updates of", list(by), more(by)));
@@ -164,10 +184,11 @@ function job(found) {
     ["leased by", holder && `${holder}, until ${time(found.expires)}`],
     ["cost", found.core_seconds == null ? null : coreTime(found.core_seconds / 3600)],
     ["manual actions", manual.map((done) => `${done.action}${done.priority == null ? "" : ` ${done.priority}`}${done.reason ? ` (${done.reason})` : ""}, ${time(done.time)}`).join("; ")],
-  ]), attempts.map(attempt));
+  ]), attempts.map((made, k) => attempt(made, found.state === "failed" && k === attempts.length - 1)));
 }
 
-function attempt(made) {
+/** `isWhy`: it is the reason why the job has failed. */
+function attempt(made, isWhy) {
   const how = made.outcome ?? "running";
   const lasted = made.ended == null ? `since ${time(made.started)}` : `after ${duration(made.ended - made.started)}`;
   const failed = made.class ? ` (${words(made.class)})` : "";
@@ -175,7 +196,7 @@ function attempt(made) {
   const more = [made.calculation && `calculation ${made.calculation}`, made.remedies && `retry adjustments: ${made.remedies}`, made.difference,
     ["labelled", "check"].includes(made.outcome) ? null : made.log]
     .filter(Boolean).join("\n");
-  return more ? element("details", { class: "attempt" }, element("summary", {}, line), element("pre", { tabindex: "0" }, more))
+  return more ? element("details", { class: "attempt", open: isWhy }, element("summary", {}, line), element("pre", { tabindex: "0" }, more))
     : element("p", { class: "attempt" }, line);
 }
 

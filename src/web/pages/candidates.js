@@ -2,7 +2,7 @@
 
 import { fetchJson } from "./api.js";
 import { FATES } from "./colours.js";
-import { element, renew, state, words } from "./dom.js";
+import { element, renew, state, titleOf, words } from "./dom.js";
 import { decimals, labelValue, shortName, whole } from "./format.js";
 import { gallery } from "./gallery.js";
 
@@ -38,7 +38,10 @@ export function show(content, rest, signal) {
   let last = 0;
   const load = async (after) => {
     const mine = ++last;
-    const wait = setTimeout(() => place.setAttribute("aria-busy", "true"), 200);
+    const wait = setTimeout(() => {
+      place.setAttribute("aria-busy", "true");
+      if (progress.textContent === "") progress.textContent = "Reading candidates …";
+    }, 200);
     try {
       const page = await fetchPage(params, after, signal, (searched) => {
         if (mine === last) progress.textContent = `${whole(searched)} candidates searched …`;
@@ -133,12 +136,12 @@ function lines({ candidates, next, imported, sorted }, params, change, pages, af
   const order = params.get("order") || "decision";
   const ascending = params.get("ascending") === "true";
   const head = ([title, isNumber, key]) => {
-    if (!key) return element("th", { scope: "col", class: isNumber && "number" }, title);
+    if (!key) return element("th", { scope: "col", class: isNumber && "number" }, titleOf(title));
     const isIt = key === order;
     const turn = () => change({ order: key, ascending: !FALLING.includes(key) && isIt && !ascending ? "true" : "" });
     const way = isIt && (ascending && !FALLING.includes(key) ? "ascending" : "descending");
     return element("th", { scope: "col", class: isNumber && "number", "aria-sort": way },
-      element("button", { type: "button", class: "sort", "data-keep": key, onclick: turn }, title, isIt ? (ascending ? "\u00a0▲" : "\u00a0▼") : ""));
+      element("button", { type: "button", class: "sort", "data-keep": key, onclick: turn }, titleOf(title), isIt ? (ascending ? "\u00a0▲" : "\u00a0▼") : ""));
   };
   const back = () => load(pages.pop());
   const on = () => {
@@ -154,7 +157,7 @@ function lines({ candidates, next, imported, sorted }, params, change, pages, af
   const number = pages.length + 1;
   const isGallery = params.get("view") === "pictures";
   return [
-    isGallery ? gallery(candidates, signal) : element("div", { class: "scrolls", role: "region", tabindex: "0", "aria-label": "Candidates" }, table),
+    candidates.length > 0 && (isGallery ? gallery(candidates, signal) : element("div", { class: "scrolls", role: "region", tabindex: "0", "aria-label": "Candidates" }, table)),
     sorted && element("p", { class: "quiet" }, sorted.all ? `Sorted: all ${whole(sorted.number)} that match and have a value.`
       : `Sorted: the newest ${whole(sorted.number)} that match and have a value; older ones are not read. Decision, γ₀_max and V/V₀ sort all.`),
     candidates.length === 0 && element("p", {}, "No candidate matches."),

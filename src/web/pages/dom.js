@@ -41,9 +41,9 @@ export function table(caption, columns, rows) {
       element("thead", {}, element("tr", {}, head)), element("tbody", {}, lines)));
 }
 
-/** A title may wrap, but its part in parentheses does not. */
-function titleOf(title) {
-  return title.split(/(\([^)]*\))/).map((part) => (part.startsWith("(") ? element("span", { class: "whole" }, part) : part));
+/** A title may wrap, but its parts in parentheses and units do not. */
+export function titleOf(title) {
+  return title.split(/(\([^)]*\)|eV\/Å)/).map((part) => (/^(\(|eV)/.test(part) ? element("span", { class: "whole" }, part) : part));
 }
 
 /** A sentence in a table, which may wrap. */

@@ -19,6 +19,10 @@ export async function show(content, _, signal) {
     place.setAttribute("aria-busy", "true");
     try {
       place.replaceChildren(...shown(await fetchComputed("/api/errors", signal)));
+    } catch (error) {
+      // Without labels there is nothing to wait for.
+      if (error.name !== "AbortError") place.replaceChildren();
+      throw error;
     } finally {
       place.removeAttribute("aria-busy");
     }

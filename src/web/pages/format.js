@@ -39,8 +39,9 @@ export function labelValue(value) {
   return value > 1e300 ? "next" : digits(value);
 }
 
-/** A number with up to six significant digits. */
+/** A number with up to six significant digits; a whole one in groups of three. */
 export function tick(value) {
+  if (Math.abs(value) >= 1000 && Math.abs(value) < 1e6 && Number.isInteger(value)) return whole(value).replace("-", "−");
   return String(Number(value.toPrecision(6))).replace("-", "−");
 }
 

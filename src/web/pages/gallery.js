@@ -21,7 +21,10 @@ export function gallery(candidates, signal) {
   const work = async () => {
     for (let card = waiting.shift(); card && !signal.aborted; card = waiting.shift()) {
       const found = await fetchJson(candidatePath(card.candidate.id, "/structure"), signal).catch(() => null);
-      if (!found) continue;
+      if (!found) {
+        card.canvas.replaceWith(element("span", { class: "quiet" }, "cannot be read"));
+        continue;
+      }
       found.species.forEach((one) => seen.add(one));
       draw(card.canvas, wrapped(found));
       legend.replaceChildren(colourNames("", Object.entries(elementColours([...seen])).map(([name, colour]) => [name, css(colour)])));
@@ -35,9 +38,9 @@ export function gallery(candidates, signal) {
 function card({ candidate, canvas }) {
   const fate = candidate.origin === "control" ? "control" : candidate.fate;
   return element("li", {}, element("a", { href: `#candidate/${encodeURIComponent(candidate.id)}`, title: candidate.id }, canvas, element("span", { class: "whole" }, shortName(candidate.id))),
-    element("span", {}, candidate.formula, ` γ₀_max ${decimals(candidate.gamma, 2)}`),
-    element("span", {}, state(fate), candidate.job_state && candidate.job_state !== "labelled" ? ` ${words(candidate.job_state)}` : "",
-      candidate.errors?.force_mae == null ? "" : ` ΔF ${decimals(candidate.errors.force_mae, 3, "eV/Å")}`));
+    element("span", {}, candidate.formula), element("span", { class: "whole" }, `γ₀_max ${decimals(candidate.gamma, 2)}`),
+    element("span", {}, state(fate), candidate.job_state && candidate.job_state !== "labelled" ? ` ${words(candidate.job_state)}` : ""),
+    candidate.errors?.force_mae != null && element("span", { class: "whole" }, `F MAE ${decimals(candidate.errors.force_mae, 3, "eV/Å")}`));
 }
 
 function draw(canvas, structure) {

@@ -15,8 +15,8 @@ const PLACES = { at: "the atom with the largest γ₀ of each structure", mean: 
 const ALL = "all elements";
 /** Points of an ellipse, and its radius in standard deviations. */
 const [ROUND, RADIUS] = [48, 2];
-/** Size of the map on wide and on narrow screens. */
-const [WIDE, NARROW, WIDE_FROM] = [[900, 500], [440, 330], 700];
+/** Width of the map on narrow and on wide screens, and what is beside it. */
+const [NARROW, WIDE, MARGINS] = [440, 900, 80];
 /** Number of walks with colours of their own. */
 const NAMED_WALKS = LINES.length;
 const GREY = "#8a8f98";
@@ -98,7 +98,8 @@ function figureOf(map, plane, at, shade, ring = () => GREY) {
   const marks = [mark("control", "frame of a control walk", "ring"), mark("biased", "accepted candidate", "circle")];
   const ellipses = plane.components.map((component, k) => ({ name: k === 0 && `training data: component of the mixture, ${RADIUS} standard deviations`,
     colour: ring(component), points: ellipse(component) }));
-  return plot({ title: "", size: innerWidth < WIDE_FROM ? NARROW : WIDE, role: "group", x: axis(0), y: axis(1), lines: ellipses, marks: marks.filter((kind) => kind.points.length > 0) });
+  const width = Math.min(Math.max(innerWidth - MARGINS, NARROW), WIDE);
+  return plot({ title: "", size: [width, Math.round(167 + 0.37 * width)], role: "group", x: axis(0), y: axis(1), lines: ellipses, marks: marks.filter((kind) => kind.points.length > 0) });
 }
 
 function describe(map, { structure, element: symbol, atom, gamma, gamma_current: current, force_error: error }) {

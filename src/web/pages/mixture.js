@@ -13,7 +13,7 @@ const COMPONENTS = [["component", true], ["θ", true], ["environments at the sta
   ["condition number", true], ["widest growth", true], ["strongest shrinkage", true], ["training σ²", true], ["component distance", true], [""]];
 
 /** Width of the longest bar. */
-const BAR = 120;
+const BAR = 100;
 
 export async function show(content, chosen, signal) {
   const again = element("button", { type: "button", onclick: () => load() }, "Recompute");

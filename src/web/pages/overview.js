@@ -53,7 +53,7 @@ export function show(content, _, signal) {
 
 function tile(title, value, ...more) {
   return element("div", { class: "tile" }, element("span", { class: "title" }, title), element("strong", {}, value),
-    ...more.map((line) => element("span", {}, line)));
+    ...more.filter(Boolean).map((line) => element("span", {}, line)));
 }
 
 function summary(status) {
@@ -66,7 +66,7 @@ function summary(status) {
   return [
     tile("Campaign", state(how), `${status.campaign.slice(0, 8)}, ${status.mode} mode`,
       status.round > 0 ? `round ${whole(status.round)}` : "", `${bytes(status.disk.bytes)} on disk`),
-    tile("Walks", underWay > 0 || walks.length === 0 ? `${whole(underWay)} ${status.run_active ? "running" : "unfinished"}` : `${whole(walks.length)} ended`,
+    tile("Walks", walks.length === 0 ? "none yet" : underWay > 0 ? `${whole(underWay)} ${status.run_active ? "running" : "unfinished"}` : `${whole(walks.length)} ended`,
       underWay > 0 || hasEarlyEnds(status.ends) ? ended(status.ends, walks.length - underWay) : "",
       status.steps_per_second == null ? "" : `${digits(status.steps_per_second)} steps/s in all`),
     tile("Candidates", `${whole(candidates.accepted)} accepted`,
@@ -89,7 +89,7 @@ function summary(status) {
       status.device.compiled > 0 && `${digits(status.device.compiled)} s for batches of new sizes`,
       status.device.restarts > 0 && element("span", { class: "wrong" }, `${whole(status.device.restarts)} restarts of the model's program`)),
     tile("Mixture", `version ${whole(version)}`,
-      training?.atoms ? `training atoms with γ > 1: ${percent(training.share_above_one)}` : "training frames are not monitored",
+      training?.atoms ? `training atoms with γ > 1: ${percent(training.share_above_one)}` : walks.length > 0 && "training frames are not monitored",
       ...forgotten(training?.elements ?? []),
       training?.alarm ? element("span", { class: "wrong" }, `forgetting: above ${exceeded(training)}`) : "",
       staleness?.quantile_90 > 1 ? `walkers had the newest version in ${percent(staleness.share_of_newest)} of decisions` : ""),
@@ -150,7 +150,7 @@ function queue(status) {
   const making = inProgress(status.labels_in_progress);
   if (failures.length === 0) return element("div", {}, list, making);
   const columns = [["class of failure"], ["failed", true], ["labelled later", true], ["unfinished", true]];
-  const rows = failures.map((failure) => [words(failure.class), whole(failure.failed), whole(failure.labelled), whole(failure.unfinished)]);
+  const rows = failures.map((failure) => [words(failure.class), failure.failed > 0 ? element("a", { href: "#candidates/order=queue&state=failed", "data-keep": `failed-${failure.class}` }, whole(failure.failed)) : "0", whole(failure.labelled), whole(failure.unfinished)]);
   return element("div", {}, list, making, table("Label failures by class", columns, rows));
 }
 
@@ -177,9 +177,10 @@ function budget(status) {
     ["cost of labels", limits.core_hours == null ? coreTime(used.core_hours) : of(used.core_hours, limits.core_hours, "core-hours")],
     ["running time", limits.wall_hours == null ? duration(3.6e6 * used.wall_hours) : of(used.wall_hours, limits.wall_hours, "h")],
     ["used up", over],
-    ["expected end", end.time == null ? null : `${time(end.time)} at the latest, if nothing changes`],
-    ["walks need", hours(end.walks_hours)],
-    ["labels need", hours(end.labels_hours)],
+    // Nothing is known before the first walk, and a time only while something runs.
+    ["expected end", end.time == null || !status.run_active || status.walks.length === 0 ? null : `${time(end.time)} at the latest, if nothing changes`],
+    ["walks need", status.walks.length === 0 ? null : hours(end.walks_hours)],
+    ["labels need", status.walks.length === 0 ? null : hours(end.labels_hours)],
   ]);
 }
 
@@ -191,6 +192,7 @@ function stateOf(walk, isRunning) {
 
 /** `changed` is called after walks were paused or resumed; false if they cannot be. */
 function walks({ walks: all, run_active }, changed) {
+  if (all.length === 0) return element("p", { class: "quiet" }, "No walk has begun.");
   const order = [...all].sort((a, b) => isUnderWay(b) - isUnderWay(a) || a.walk - b.walk);
   const change = (some, isPaused) => () => {
     // The next update confirms it.
@@ -199,7 +201,7 @@ function walks({ walks: all, run_active }, changed) {
   };
   const button = (walk) => (isUnderWay(walk) || walk.paused) && pauseButton(walk.walk, walk.paused, change([walk], !walk.paused));
   const rows = order.slice(0, WALKS).map((walk) => [
-    element("a", { href: `#walk/${walk.walk}`, "data-keep": `walk-${walk.walk}` }, whole(walk.walk)), walk.seed_structure, walk.origin, sentence(state(stateOf(walk, run_active)), walk.reason && ` ${walk.reason}`),
+    element("a", { href: `#walk/${walk.walk}`, "data-keep": `walk-${walk.walk}` }, whole(walk.walk)), walk.seed_structure, walk.origin, sentence(state(stateOf(walk, run_active)), walk.reason && element("span", { class: "reason" }, walk.reason)),
     whole(walk.reference_step ?? walk.step), decimals(walk.temperature, 0, "K"), decimals(walk.relative_volume, 4), decimals(walk.gamma_max, 2),
     decimals(walk.gamma_max_original, 2),
     digits(walk.tau), digits(walk.steps_per_second), whole(walk.accepted), whole(walk.rejected), ...(changed ? [button(walk) || ""] : [])]);

@@ -4,6 +4,8 @@ import { drawing, element } from "./dom.js";
 import { digits, tick } from "./format.js";
 
 const [LEFT, BOTTOM, TOP, RIGHT] = [54, 40, 10, 12];
+/** Room for the title of the vertical axis, and for each character of its numbers. */
+const [TITLE, CHARACTER] = [24, 6.8];
 /** Width and height of a plot. */
 const SIZE = [440, 230];
 
@@ -25,14 +27,15 @@ export function plot({ title, size = SIZE, role = "img", x, y, lines = [], bands
   const all = [...points, ...edges].filter(([a, b]) => Number.isFinite(a) && Number.isFinite(b));
   if (all.length === 0) return figure(title, [], element("p", { class: "quiet empty" }, "no data yet"));
   const [width, height] = size;
-  const across = axis(x, all.map(([value]) => value), LEFT, width - RIGHT);
   const up = axis(y, all.map(([, value]) => value), height - BOTTOM, TOP);
+  const left = Math.max(LEFT, ...up.ticks.map((value) => TITLE + CHARACTER * up.text(value).length));
+  const across = axis(x, all.map(([value]) => value), left, width - RIGHT);
   const svg = drawing("svg", { viewBox: `0 0 ${width} ${height}`, role, "aria-label": described(title, x, y, lines, marks, all) },
-    grid(across, up, size), titles(x, y, size),
+    grid(across, up, size, left), titles(x, y, size, left),
     bands.map((band) => drawing("path", { d: area(band.points, across, up), fill: band.colour, "fill-opacity": 0.2 })),
     lines.map((line) => drawing("path", { d: path(line.points, across, up), fill: "none", stroke: line.colour, "stroke-width": 1.7,
       "stroke-dasharray": line.dash ?? "", "stroke-linejoin": "round", "stroke-linecap": "round" })),
-    marks.flatMap((kind) => kind.points.map((point) => mark(kind, point, across, up))));
+    marks.flatMap((kind) => kind.points.flatMap((point) => mark(kind, point, across, up))));
   return figure(title, [...lines, ...marks].filter((one) => one.name), svg);
 }
 
@@ -52,9 +55,11 @@ function paint(colour, shape) {
   return HOLLOW.has(shape) ? { fill: "none", stroke: colour, "stroke-width": 1.5 } : { fill: colour, "fill-opacity": 0.75 };
 }
 
-function mark({ colour: ofKind, shape }, [x, y, href, text, colour = ofKind], across, up) {
-  const drawn = drawing("path", { d: SHAPES[shape], transform: `translate(${across.at(x).toFixed(1)} ${up.at(y).toFixed(1)})`,
-    ...paint(colour, shape) }, text && drawing("title", {}, text));
+function mark({ colour: ofKind, shape }, [x, y, href, text, ofPoint], across, up) {
+  const place = { d: SHAPES[shape], transform: `translate(${across.at(x).toFixed(1)} ${up.at(y).toFixed(1)})` };
+  // The ends of a scale of colours are as light or as dark as paper.
+  const outline = ofPoint && drawing("path", { ...place, class: HOLLOW.has(shape) ? "outline hollow" : "outline" });
+  const drawn = [outline, drawing("path", { ...place, ...paint(ofPoint ?? ofKind, shape) }, text && drawing("title", {}, text))];
   return href ? drawing("a", { href, tabindex: "-1" }, drawn) : drawn;
 }
 
@@ -96,20 +101,26 @@ function roundPowers(low, high) {
   return powers.flatMap((power) => factors.map((factor) => factor * 10 ** power)).filter(inside);
 }
 
-function grid(across, up, [width, height]) {
+function grid(across, up, [width, height], left) {
   return drawing("g", { class: "grid" },
     across.ticks.map((value) => [
       drawing("path", { d: `M${across.at(value)} ${TOP}V${height - BOTTOM}` }),
-      drawing("text", { x: across.at(value), y: height - BOTTOM + 14, "text-anchor": "middle" }, across.text(value))]).flat(),
+      label(across.text(value), across.at(value), left, width, height - BOTTOM + 14)]).flat(),
     up.ticks.map((value) => [
-      drawing("path", { d: `M${LEFT} ${up.at(value)}H${width - RIGHT}` }),
-      drawing("text", { x: LEFT - 6, y: up.at(value) + 3.5, "text-anchor": "end" }, up.text(value))]).flat());
+      drawing("path", { d: `M${left} ${up.at(value)}H${width - RIGHT}` }),
+      drawing("text", { x: left - 6, y: up.at(value) + 3.5, "text-anchor": "end" }, up.text(value))]).flat());
 }
 
-function titles(x, y, [width, height]) {
+/** The number of a tick of the horizontal axis, moved where it would be cut off or would touch a number of the vertical axis. */
+function label(text, x, left, width, y) {
+  const half = (CHARACTER * text.length) / 2;
+  return drawing("text", { x: Math.max(left - 4 + half, Math.min(x, width - 1 - half)), y, "text-anchor": "middle" }, text);
+}
+
+function titles(x, y, [width, height], left) {
   const middle = (TOP + height - BOTTOM) / 2;
   return drawing("g", { class: "titles" },
-    drawing("text", { x: (LEFT + width - RIGHT) / 2, y: height - 6, "text-anchor": "middle" }, x.title),
+    drawing("text", { x: (left + width - RIGHT) / 2, y: height - 6, "text-anchor": "middle" }, x.title),
     drawing("text", { x: 11, y: middle, "text-anchor": "middle", transform: `rotate(-90 11 ${middle})` }, y.title));
 }
 

@@ -2,7 +2,7 @@
 
 import { fetchJson, listen } from "./api.js";
 import { DASHES, FATES, LINES } from "./colours.js";
-import { words } from "./dom.js";
+import { element, words } from "./dom.js";
 import { shortName, tick } from "./format.js";
 import { plot } from "./plot.js";
 
@@ -14,11 +14,13 @@ const NEWEST = 200;
 export function overTime(place, signal) {
   let samples = [];
   let newest = [];
-  let seen = -1;
-  const draw = () => place.replaceChildren(...(samples.length > 1 ? drawn(samples) : []), newestCandidates(newest));
+  let [seen, runs] = [-1, false];
+  // The walks of a campaign that is stopped do not change.
+  const draw = () => place.replaceChildren(...(runs && samples.length > 1 ? drawn(samples) : []), newestCandidates(newest));
   const begin = fetchJson("/api/samples", signal).then((found) => { samples = found; }).catch(() => {});
   listen(async ({ status, sample }) => {
     await begin;
+    runs = status.run_active;
     if (samples.at(-1)?.time !== sample.time) samples.push(sample);
     if (samples.length > MAX_SAMPLES) samples = samples.filter((_, k) => k % 2 === 0);
     const now = status.candidates.seen + status.candidates.control;
@@ -56,6 +58,7 @@ function ofOneVersion({ candidates, versions }) {
 }
 
 function newestCandidates(newest) {
+  if (newest.length === 0) return element("p", { class: "quiet" }, "No candidate has been found yet.");
   const fate = (candidate) => (candidate.origin === "control" ? "control" : candidate.fate);
   const point = (candidate) => [candidate.relative_volume, candidate.gamma, `#candidate/${encodeURIComponent(candidate.id)}`,
     `${shortName(candidate.id)}: ${words(fate(candidate))}`];

@@ -3,7 +3,7 @@
 import { fetchJson, listen } from "./api.js";
 import { DASHES, FATES, LINES } from "./colours.js";
 import { element, facts, section, state, words } from "./dom.js";
-import { decimals, digits, whole } from "./format.js";
+import { decimals, digits, tick, whole } from "./format.js";
 import { plot } from "./plot.js";
 
 export const TITLE = "Walk";
@@ -51,7 +51,7 @@ function about({ walk, seed_structure: seed, origin, state: how, conditions, poi
 }
 
 function drawn({ points, threshold, origin }, candidates, inPs) {
-  const x = { title: inPs ? "time (ps)" : "step", least: 0 };
+  const x = { title: inPs ? "time (ps)" : "step", least: 0, ticks: inPs ? tick : whole };
   const fsPerStep = points.findLast((point) => point.step > 0)?.time / points.findLast((point) => point.step > 0)?.step || 0;
   const at = (step) => (inPs ? (step * fsPerStep) / 1000 : step);
   // A roll back begins a new piece of the line.

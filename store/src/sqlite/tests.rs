@@ -13,8 +13,9 @@ use crate::database::Database;
 use crate::error::StoreError;
 use crate::records::{CampaignRecord, Commit, ComponentRecord};
 use crate::tables::{
-    attempt_end, candidate_history, exclude, export, job_counts, label_arrivals, label_values, listing,
-    lower_states, outcomes, queue, queue_admin, recent, status, structures, versions, without_label,
+    attempt_end, candidate_history, exclude, export, feature_sample, job_counts, label_arrivals,
+    label_values, listing, lower_states, outcomes, queue, queue_admin, recent, status, structures, versions,
+    without_label,
 };
 
 /// The store in a directory, and its file.
@@ -52,7 +53,11 @@ async fn frequent_queries_use_indexes() {
         attempt_end::LOSSES,
         queue_admin::FIND,
         export::CANDIDATES,
+        export::LISTED,
         export::IMPORTS,
+        feature_sample::NUMBER,
+        feature_sample::SAMPLED,
+        feature_sample::FEATURES,
         candidate_history::NUMBERED,
         candidate_history::BEGINNING,
         candidate_history::FIRST,
@@ -93,6 +98,14 @@ async fn frequent_queries_use_indexes() {
     for sql in [queue_admin::LIST, listing::QUEUE] {
         let page = plan(&file, sql).await;
         assert!(page.contains("USING COVERING INDEX job_order (state=?"), "{page}");
+    }
+    for sql in [listing::NEWEST_OF_WALK, listing::OLDEST_OF_WALK] {
+        let page = plan(&file, sql).await.replace("SCAN page", "");
+        assert!(
+            page.contains("SEARCH candidate USING COVERING INDEX") && page.contains("(id>? AND id<?)"),
+            "{page}"
+        );
+        assert!(!page.contains("SCAN"), "{page}");
     }
     let sum = plan(&file, label_arrivals::SUM).await;
     assert!(

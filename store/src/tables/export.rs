@@ -4,36 +4,49 @@ use std::collections::{BTreeMap, HashSet};
 
 use wire::ContentHash;
 
+use super::decision_list::{decision_list, lists};
 use super::label_row::LabelRow;
 use super::restore::{block, grades, origin};
 use crate::Store;
 use crate::checksum::{CANDIDATE, DECISION, IMPORT, Names, ORIGINAL_GRADES, SEED_STRUCTURE, WALK, joined};
-use crate::database::{FromRow, SqlRow, query};
+use crate::database::{FromRow, SqlRow, from_columns, query};
 use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
 use crate::export::{ExportCursor, ExportFilter, ExportRow, ExportSource, LabelMark};
 
-pub(crate) const CANDIDATES: &str = concat!(
-    "SELECT candidate.decision AS decision, original_checksum, block, original_grades, seed_structure.seed AS seed, ",
-    joined!(candidate),
-    ", ",
-    joined!(decision),
-    ", ",
-    joined!(seed_structure),
-    ", ",
-    joined!(structure),
-    ", label.*
-    FROM candidate
-    CROSS JOIN label ON label.structure = candidate.structure AND label.protocol = $1 AND status = 'label'
-    CROSS JOIN structure ON structure.number = candidate.structure
-    CROSS JOIN decision ON decision.sequence = candidate.decision
-    CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
-    LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
-    WHERE candidate.decision > $2 AND CASE origin WHEN 'biased' THEN $3 ELSE $4 END = 1
-    AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure AND job.protocol = $1
-                    AND state = 'dropped')
-    ORDER BY candidate.decision LIMIT $5"
-);
+macro_rules! candidates {
+    ($which:expr, $limit:literal) => {
+        concat!(
+            "SELECT candidate.decision AS decision, original_checksum, block, original_grades, seed_structure.seed AS seed, ",
+            joined!(candidate),
+            ", ",
+            joined!(decision),
+            ", ",
+            joined!(seed_structure),
+            ", ",
+            joined!(structure),
+            ", label.*
+            FROM candidate
+            CROSS JOIN label ON label.structure = candidate.structure AND label.protocol = $1 AND status = 'label'
+            CROSS JOIN structure ON structure.number = candidate.structure
+            CROSS JOIN decision ON decision.sequence = candidate.decision
+            CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
+            LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
+            WHERE candidate.decision ",
+            $which,
+            " AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure AND job.protocol = $1
+                              AND state = 'dropped')
+            ORDER BY candidate.decision",
+            $limit
+        )
+    };
+}
+
+pub(crate) const CANDIDATES: &str =
+    candidates!("> $2 AND CASE origin WHEN 'biased' THEN $3 ELSE $4 END = 1", " LIMIT $5");
+
+/// Those of a list of decisions.
+pub(crate) const LISTED: &str = candidates!(concat!("IN ", decision_list!()), "");
 
 /// Imported structures that are not exported as candidates.
 pub(crate) const IMPORTS: &str = concat!(
@@ -78,6 +91,14 @@ const OF_BOTH_ORIGINS: &str = "SELECT DISTINCT content FROM candidate WHERE orig
 
 const CONTROL_WALKS: &str =
     concat!("SELECT ", joined!(walk), " FROM walk WHERE origin = 'control' ORDER BY walk.walk");
+
+/// A protocol by its hash.
+struct ProtocolRow {
+    number: i64,
+    name: String,
+}
+
+from_columns!(ProtocolRow { number, name });
 
 impl Store {
     /// The control walks, each with the biased walk that it matches. A control frame matches the candidate that its biased walk found
@@ -131,12 +152,7 @@ impl Store {
         after: Option<ExportCursor>,
         limit: u32,
     ) -> Result<Vec<ExportRow>> {
-        let name = query("SELECT name FROM protocol WHERE hash = $1").bind(filter.protocol.0.to_vec());
-        let name: Option<String> = name.fetch_optional(&self.database).await?;
-        let name = name.ok_or_else(|| StoreError::UnknownProtocol(filter.protocol.to_string()))?;
-        let sql = "SELECT number FROM protocol WHERE hash = $1";
-        let number = query(sql).bind(filter.protocol.0.to_vec());
-        let number: i64 = number.fetch_one(&self.database).await?;
+        let ProtocolRow { number, name } = self.protocol_row(filter.protocol).await?;
         let (decision, last_import) = match after {
             None => (Some(0), 0),
             Some(ExportCursor::Candidate(decision)) => (Some(decision), 0),
@@ -158,6 +174,29 @@ impl Store {
             }
         }
         Ok(rows)
+    }
+
+    /// The labelled ones among the candidates and frames of control walks of these decisions, as [`Self::labelled`] reads them.
+    pub async fn labelled_candidates(
+        &self,
+        protocol: ContentHash,
+        decisions: &[i64],
+    ) -> Result<Vec<ExportRow>> {
+        let ProtocolRow { number, name } = self.protocol_row(protocol).await?;
+        let mut found = Vec::new();
+        for list in lists(decisions) {
+            let page = query(LISTED).bind(number).bind_all(list);
+            for row in page.rows(&self.database).await? {
+                found.push(candidate(&row, &name, protocol)?);
+            }
+        }
+        Ok(found)
+    }
+
+    async fn protocol_row(&self, protocol: ContentHash) -> Result<ProtocolRow> {
+        let found = query("SELECT number, name FROM protocol WHERE hash = $1").bind(protocol.0.to_vec());
+        let found = found.fetch_optional(&self.database).await?;
+        found.ok_or_else(|| StoreError::UnknownProtocol(protocol.to_string()))
     }
 }
 

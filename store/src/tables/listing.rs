@@ -50,7 +50,7 @@ impl FromRow for ListedCandidate {
 }
 
 macro_rules! lines {
-    ($($rest:literal),*) => {
+    ($($rest:expr),*) => {
         concat!(
             "SELECT ",
             joined!(candidate),
@@ -63,23 +63,21 @@ macro_rules! lines {
     };
 }
 
+/// What belongs to the candidates of a page.
+macro_rules! joins {
+    () => {
+        " LEFT JOIN job ON job.number = (SELECT max(newest.number) FROM job AS newest
+                                        WHERE newest.structure = candidate.structure)
+        LEFT JOIN label ON label.structure = candidate.structure AND label.protocol = job.protocol
+            AND status = 'label'
+        CROSS JOIN decision ON sequence = candidate.decision
+        LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure"
+    };
+}
+
 macro_rules! page {
     ($which:literal, $order:literal, $limit:literal) => {
-        lines!(
-            "FROM candidate
-            LEFT JOIN job ON job.number = (SELECT max(newest.number) FROM job AS newest
-                                           WHERE newest.structure = candidate.structure)
-            LEFT JOIN label ON label.structure = candidate.structure AND label.protocol = job.protocol
-                AND status = 'label'
-            CROSS JOIN decision ON sequence = candidate.decision
-            LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
-            WHERE ",
-            $which,
-            " ORDER BY ",
-            $order,
-            " LIMIT ",
-            $limit
-        )
+        lines!("FROM candidate", joins!(), " WHERE ", $which, " ORDER BY ", $order, " LIMIT ", $limit)
     };
 }
 
@@ -115,6 +113,25 @@ pub(crate) const SMALLEST_VOLUME: &str =
 
 /// Candidates of a walk, ordered by name.
 pub(crate) const OF_WALK: &str = page!("id >= $1 AND id < $1 || '~'", "id", "$2");
+
+/// The index of names gives the decisions of a walk. With a plus, SQLite does not search the decisions of all walks for them.
+macro_rules! decided_of_walk {
+    ($compare:literal, $way:literal) => {
+        lines!(
+            "FROM (SELECT decision AS place FROM candidate WHERE id >= $1 AND id < $1 || '~' AND +decision ",
+            $compare,
+            " $2 ORDER BY +decision",
+            $way,
+            " LIMIT $3) AS page CROSS JOIN candidate ON candidate.decision = place",
+            joins!(),
+            " ORDER BY candidate.decision",
+            $way
+        )
+    };
+}
+
+pub(crate) const NEWEST_OF_WALK: &str = decided_of_walk!("<", " DESC");
+pub(crate) const OLDEST_OF_WALK: &str = decided_of_walk!(">", "");
 
 /// The index gives the jobs; only those of the page are read. Jobs of imported structures, whose numbers are above all
 /// decisions, are left out.
@@ -183,12 +200,30 @@ impl Store {
 
     /// Candidates of a walk, ordered by step. Returns only some if the walk has more than `limit`.
     pub async fn list_walk(&self, walk: u32, limit: u32) -> Result<Vec<ListedCandidate>> {
-        let campaign = self.campaign_value("id").await?;
-        let begin = format!("{}-{walk}.", campaign.get(..8).unwrap_or_default());
-        let query = query(OF_WALK).bind(begin).bind(limit);
+        let query = query(OF_WALK).bind(self.names_of_walk(walk).await?).bind(limit);
         let mut found: Vec<ListedCandidate> = query.fetch_all(&self.database).await?;
         found.sort_by_key(|candidate| (candidate.segment, candidate.step, candidate.decision));
         Ok(found)
+    }
+
+    /// At most `limit` candidates of a walk in decision order, as [`Self::list_fate`].
+    pub async fn list_decided_of_walk(
+        &self,
+        walk: u32,
+        descending: bool,
+        after: Option<i64>,
+        limit: u32,
+    ) -> Result<Vec<ListedCandidate>> {
+        let query = query(if descending { NEWEST_OF_WALK } else { OLDEST_OF_WALK });
+        let query =
+            query.bind(self.names_of_walk(walk).await?).bind(after.unwrap_or(first(descending).decision));
+        query.bind(limit).fetch_all(&self.database).await
+    }
+
+    /// What the names of a walk's candidates begin with.
+    async fn names_of_walk(&self, walk: u32) -> Result<String> {
+        let campaign = self.campaign_value("id").await?;
+        Ok(format!("{}-{walk}.", campaign.get(..8).unwrap_or_default()))
     }
 }
 

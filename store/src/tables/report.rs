@@ -1,8 +1,6 @@
 //! Pages of collected structures, and the fates of candidates, for reports.
 
-use std::ops::Range;
-
-use wire::{ContentHash, Origin};
+use wire::ContentHash;
 
 use super::label_row::LabelRow;
 use super::restore::{block, grades, origin};
@@ -36,9 +34,6 @@ const BY_SEED_STRUCTURE: &str =
 const BY_WALK: &str = "SELECT walk AS part, coalesce(reason, fate) AS fate, count(*) AS number
     FROM candidate WHERE origin = 'biased' GROUP BY 1, 2 ORDER BY 1, 2";
 
-const COLLECTED_DECISIONS: &str = "SELECT decision FROM candidate
-    WHERE origin = $1 AND fate = 'accepted' AND walk >= $2 AND walk < $3 ORDER BY decision";
-
 /// No protocol has it.
 const NO_PROTOCOL: i64 = -1;
 
@@ -60,12 +55,6 @@ impl Store {
         let page = page.fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         Ok(page)
-    }
-
-    /// Sequence numbers of the decisions on accepted candidates, or on frames of control walks, of these walks.
-    pub async fn collected_decisions(&self, origin: Origin, walks: Range<i64>) -> Result<Vec<i64>> {
-        let found = query(COLLECTED_DECISIONS).bind(origin.name()).bind(walks.start).bind(walks.end);
-        found.fetch_all(&self.database).await
     }
 
     /// Fates of candidates of biased walks, by intervals of the decision log: decisions 1 to `length` are part 0.

@@ -2,8 +2,8 @@
 
 use std::cmp::Ordering;
 
-use monitor::candidate_errors::CandidateErrors;
-use store::ListedCandidate;
+use monitor::candidate_errors::{CandidateErrors, ErrorReader};
+use store::{ListedCandidate, Store, StoreError, WalkVersions};
 
 macro_rules! columns {
     ($($column:ident $name:literal),* $(,)?) => {
@@ -40,6 +40,26 @@ pub struct TableRow {
     pub version: u32,
     /// `None` without a label under the protocol in force.
     pub errors: Option<CandidateErrors>,
+}
+
+impl TableRow {
+    /// Without its errors.
+    pub fn new(candidate: ListedCandidate, versions: &WalkVersions) -> Self {
+        Self { version: versions.version_of(candidate.walk), errors: None, candidate }
+    }
+}
+
+/// Reads the errors of rows that have a label.
+pub async fn read_errors(
+    rows: &mut [TableRow],
+    store: &Store,
+    reader: &mut ErrorReader,
+) -> Result<(), StoreError> {
+    let mut labelled: Vec<_> = rows.iter_mut().filter(|row| row.candidate.energy.is_some()).collect();
+    let places: Vec<_> = labelled.iter().map(|row| (row.candidate.decision, row.version)).collect();
+    let errors = reader.read(store, &places).await?;
+    labelled.iter_mut().zip(errors).for_each(|(row, errors)| row.errors = errors);
+    Ok(())
 }
 
 impl SortColumn {

@@ -10,7 +10,7 @@ use axum::extract::{RawQuery, State};
 use axum::http::{StatusCode, header};
 use axum::response::IntoResponse;
 use futures_util::stream::{self, StreamExt};
-use store::{ExportCursor, ExportFilter, ListedCandidate, Store};
+use store::{ExportCursor, ListedCandidate, Store};
 use wire::{ContentHash, WalkConditions, WalkId};
 
 use super::query::{CandidateQuery, TableOrder};
@@ -22,6 +22,8 @@ use crate::web::dashboard::response::{ApiError, ApiResult};
 /// Largest number of structures in a file, and of candidates searched for them.
 const MAX_STRUCTURES: usize = 2000;
 const MAX_SEARCHED: usize = 100_000;
+/// Structures in memory at a time.
+const PAGE: usize = 32;
 
 /// What all frames need.
 struct FrameWriter {
@@ -62,15 +64,14 @@ pub async fn extxyz(State(dashboard): State<Dashboard>, RawQuery(query): RawQuer
         conditions: store.walk_conditions().await?,
         store,
     });
-    // The first frame before the headers, so that a damaged store is an error and no short file.
-    let mut rows = found.rows.into_iter();
-    let first = match rows.next() {
-        Some(row) => writer.frame(&row).await?,
-        None => Vec::new(),
-    };
-    let rest = stream::iter(rows).then(move |row| {
+    // The first frames before the headers, so that a damaged store is an error and no short file.
+    let mut rows = found.rows;
+    let others = rows.split_off(rows.len().min(PAGE));
+    let first = writer.frames(&rows).await?;
+    let pages: Vec<_> = others.chunks(PAGE).map(<[_]>::to_vec).collect();
+    let rest = stream::iter(pages).then(move |rows| {
         let writer = Arc::clone(&writer);
-        async move { writer.frame(&row).await.map_err(Box::<dyn Error + Send + Sync>::from) }
+        async move { writer.frames(&rows).await.map_err(Box::<dyn Error + Send + Sync>::from) }
     });
     let body = Body::from_stream(stream::iter([Ok(first)]).chain(rest));
     let disposition = "attachment; filename=\"candidates.extxyz\"";
@@ -80,24 +81,26 @@ pub async fn extxyz(State(dashboard): State<Dashboard>, RawQuery(query): RawQuer
 }
 
 impl FrameWriter {
-    /// The text of a structure.
-    async fn frame(&self, row: &ListedCandidate) -> Result<Vec<u8>, ApiError> {
-        let labelled = match (self.protocol, row.energy) {
-            (Some(protocol), Some(_)) => {
-                let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
-                let before = Some(ExportCursor::Candidate(row.decision - 1));
-                let found = self.store.labelled(&filter, before, 1).await?.pop();
-                found.filter(|found| found.cursor == ExportCursor::Candidate(row.decision))
-            }
-            _ => None,
+    /// The text of structures.
+    async fn frames(&self, rows: &[ListedCandidate]) -> Result<Vec<u8>, ApiError> {
+        let decisions: Vec<_> =
+            rows.iter().filter(|row| row.energy.is_some()).map(|row| row.decision).collect();
+        let labelled = match self.protocol {
+            Some(protocol) => self.store.labelled_candidates(protocol, &decisions).await?,
+            None => Vec::new(),
         };
-        let frame = match labelled {
-            Some(labelled) => export_frame::frame(labelled, LabelKeys::Ase, &self.campaign, &self.conditions),
-            None => frame_of(&self.store, &row.id).await?,
-        };
+        let mut labelled: BTreeMap<_, _> = labelled.into_iter().map(|row| (row.cursor, row)).collect();
         let mut bytes = Vec::new();
-        write_frame(&mut bytes, &frame)
-            .map_err(|error| ApiError::new(StatusCode::UNPROCESSABLE_ENTITY, error))?;
+        for row in rows {
+            let frame = match labelled.remove(&ExportCursor::Candidate(row.decision)) {
+                Some(labelled) => {
+                    export_frame::frame(labelled, LabelKeys::Ase, &self.campaign, &self.conditions)
+                }
+                None => frame_of(&self.store, &row.id).await?,
+            };
+            write_frame(&mut bytes, &frame)
+                .map_err(|error| ApiError::new(StatusCode::UNPROCESSABLE_ENTITY, error))?;
+        }
         Ok(bytes)
     }
 }

@@ -19,7 +19,7 @@ use self::columns::TableRow;
 use self::query::{CandidateQuery, PagePlace, TableOrder};
 use super::Dashboard;
 use super::response::{ApiResult, json};
-use crate::filter::{StructureProperties, species};
+use crate::filter::{StructureFilter, StructureProperties, species};
 
 /// Largest number of rows of a page, and the number without `limit`.
 const MAX_PAGE_ROWS: u32 = 200;
@@ -50,16 +50,9 @@ pub async fn page(State(dashboard): State<Dashboard>, RawQuery(query): RawQuery)
         (found.rows, found.next, found.scanned, Some(found.among))
     } else {
         let CandidatePage { rows, next, scanned } = query.page(store).await?;
-        let mut found = Vec::new();
-        for candidate in rows {
-            let version = versions.version_of(candidate.walk);
-            let errors = match candidate.energy {
-                Some(_) => reader.read(store, candidate.decision, version).await?,
-                None => None,
-            };
-            found.push(TableRow { candidate, version, errors });
-        }
-        (found, next.map(PagePlace::Behind), scanned, None)
+        let mut rows: Vec<_> = rows.into_iter().map(|one| TableRow::new(one, &versions)).collect();
+        columns::read_errors(&mut rows, store, &mut reader).await?;
+        (rows, next.map(PagePlace::Behind), scanned, None)
     };
     let imported = match query.state.filter(|_| query.order == TableOrder::Queue) {
         Some(state) => Some(store.imported_jobs(state).await?),
@@ -133,6 +126,11 @@ impl CandidateQuery {
     ) -> Result<Vec<ListedCandidate>, StoreError> {
         // By a column, the newest are sorted.
         let descending = !self.ascending || matches!(self.order, TableOrder::Column(_));
+        let walk = self.filter.as_ref().and_then(StructureFilter::only_walk);
+        if let (TableOrder::Decision | TableOrder::Column(_), Some(walk)) = (self.order, walk) {
+            let after = after.map(|place| place.decision);
+            return store.list_decided_of_walk(walk, descending, after, limit).await;
+        }
         let order = match (self.order, self.state, self.fate.as_deref()) {
             (TableOrder::Queue, Some(state), _) => {
                 return store.list_queue(state, after, limit).await;

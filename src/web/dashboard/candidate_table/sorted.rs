@@ -4,7 +4,7 @@ use monitor::candidate_errors::ErrorReader;
 use serde::Serialize;
 use store::{Store, StoreError, WalkVersions};
 
-use super::columns::{SortColumn, TableRow};
+use super::columns::{SortColumn, TableRow, read_errors};
 use super::query::{CandidateQuery, PagePlace};
 use super::{DEFAULT_ROWS, MAX_SCANNED};
 
@@ -38,21 +38,15 @@ pub(super) async fn page(
 ) -> Result<SortedPage, StoreError> {
     let found = query.collect(store, None, MAX_SCANNED, MAX_SCANNED).await?;
     let mut is_all = found.next.is_none();
-    let (mut sorted, mut with_errors) = (Vec::new(), 0);
-    for candidate in found.rows {
-        let mut row = TableRow { version: versions.version_of(candidate.walk), errors: None, candidate };
-        if column.is_error() && row.candidate.energy.is_some() {
-            if with_errors == MAX_WITH_ERRORS {
-                is_all = false;
-                break;
-            }
-            with_errors += 1;
-            row.errors = reader.read(store, row.candidate.decision, row.version).await?;
-        }
-        if let Some(value) = column.value(&row) {
-            sorted.push((value, row));
-        }
+    let mut rows: Vec<_> = found.rows.into_iter().map(|one| TableRow::new(one, versions)).collect();
+    if column.is_error() {
+        rows.retain(|row| row.candidate.energy.is_some());
+        is_all &= rows.len() <= MAX_WITH_ERRORS;
+        rows.truncate(MAX_WITH_ERRORS);
+        read_errors(&mut rows, store, reader).await?;
     }
+    let mut sorted: Vec<_> =
+        rows.into_iter().filter_map(|row| column.value(&row).map(|value| (value, row))).collect();
     sorted.sort_by(|(a, of_a), (b, of_b)| {
         let order = a.compare(b).then(of_a.candidate.decision.cmp(&of_b.candidate.decision));
         if query.ascending { order } else { order.reverse() }
@@ -66,8 +60,8 @@ pub(super) async fn page(
     let next = begin.saturating_add(limit);
     let next = (next < sorted.len()).then_some(PagePlace::Rows(next));
     let mut rows: Vec<_> = sorted.into_iter().skip(begin).take(limit).map(|(_, row)| row).collect();
-    for row in rows.iter_mut().filter(|row| row.errors.is_none() && row.candidate.energy.is_some()) {
-        row.errors = reader.read(store, row.candidate.decision, row.version).await?;
+    if !column.is_error() {
+        read_errors(&mut rows, store, reader).await?;
     }
     Ok(SortedPage { rows, next, scanned: found.scanned, among })
 }
