@@ -23,8 +23,6 @@ mod run;
 mod scenario;
 mod shrink;
 mod slurm;
-mod slurm_files;
-mod slurm_labeller;
 mod supervision;
 mod versions;
 mod walker;

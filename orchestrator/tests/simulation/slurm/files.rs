@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use dft::{FailureClass, RetryAdjustment};
 use workers::labeller::decisions::{CalculationEnd, JobDirectory, Traces};
 
-use super::fault::Time;
+use super::super::fault::Time;
 
 /// Files from other hosts are visible after this time, unless the file system is in trouble.
 pub const SETTLE_TIME: Time = 2_000;

@@ -1,128 +1,33 @@
 //! A stand-in for Slurm: its queue, nodes and daemon, with commands that take time, are refused or lose their replies. It
 //! answers in the words of `squeue`, which the labeller's own parser reads.
 
+mod fault;
+mod files;
+mod labeller;
+mod requests;
+
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
-use std::fmt;
 use std::path::PathBuf;
 use std::rc::Rc;
-use std::task::{Context, Poll, Waker};
 
 use dft::{Exit as ProgramExit, FailureClass, RetryAdjustment};
-use store::CalculationRecord;
-use store::records::Lease;
 use workers::labeller::decisions::{CalculationEnd, EndReason};
 
-use super::fault::{ClientKind, Time};
+use super::fault::Time;
 use super::ladder::{Difficulty, Ladders};
-use super::random::Random;
-use super::slurm_files::{SETTLE_TIME, SharedFiles};
-use super::slurm_labeller::{Answer, Exchange, LabellerIo, Request, SQUEUE_INTERVAL, SlurmTask, TaskEnd};
-use super::world::{Event, Exit, World};
+use super::world::{Event, World};
+use fault::ENDS;
+use files::{SETTLE_TIME, SharedFiles};
+use labeller::{Answer, Request, SlurmTask};
+
+pub use fault::SlurmFault;
 
 const NODES: [&str; 3] = ["n1", "n2", "n3"];
 /// Time between two tries to begin a job that waits for another one, or for Slurm.
 const SCHEDULING_INTERVAL: Time = 1_000;
 /// A command whose reply is lost fails after this time.
 const REPLY_TIMEOUT: Time = 10_000;
-/// Time between two tries of a write while the database is busy or the disk full.
-const STORE_RETRY_INTERVAL: Time = 1_000;
-/// States of jobs that end without a word of their runner, with what Slurm writes into the job's log.
-const ENDS: [(&str, FailureClass, &str); 7] = [
-    (
-        "TIMEOUT",
-        FailureClass::TimeLimit,
-        "slurmstepd: error: *** JOB 1 ON n1 CANCELLED AT now DUE TO TIME LIMIT ***",
-    ),
-    (
-        "OUT_OF_MEMORY",
-        FailureClass::OutOfMemory,
-        "slurmstepd: error: Detected 1 oom_kill event in StepId=1.batch.",
-    ),
-    (
-        "FAILED",
-        FailureClass::OutOfMemory,
-        "slurmstepd: error: StepId=1.batch exceeded memory limit (2 > 1), being killed",
-    ),
-    (
-        "NODE_FAIL",
-        FailureClass::NodeFailure,
-        "slurmstepd: error: *** JOB 1 ON n1 CANCELLED AT now DUE TO NODE FAILURE ***",
-    ),
-    ("CANCELLED", FailureClass::NodeFailure, "slurmstepd: error: *** JOB 1 ON n1 CANCELLED AT now ***"),
-    (
-        "PREEMPTED",
-        FailureClass::NodeFailure,
-        "slurmstepd: error: *** JOB 1 ON n1 CANCELLED AT now DUE TO PREEMPTION ***",
-    ),
-    ("FAILED", FailureClass::NodeFailure, "Killed"),
-];
-
-/// What goes wrong with Slurm and its nodes.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum SlurmFault {
-    /// slurmctld does not answer. Jobs go on, and their ends are known later.
-    Away { until: Time },
-    /// The queue is full.
-    Full { until: Time },
-    /// The reply to the next `sbatch` is lost: there is a job all the same.
-    ReplyLost,
-    /// A labeller is killed during its next `sbatch`, which submits the job later.
-    LateSubmission { delay: Time },
-    /// A job ends, in one of the ways of [`ENDS`].
-    JobEnds { how: usize },
-    /// A job that waits is cancelled.
-    WaitingJobCancelled,
-    /// What nodes write is seen much later.
-    FilesLate { until: Time },
-    /// The directory of a calculation is removed.
-    DirectoryRemoved,
-}
-
-impl SlurmFault {
-    pub fn draw(random: &mut Random, until: Time) -> Self {
-        match random.below(16) {
-            0..3 => Self::Away { until },
-            3 => Self::Full { until },
-            4..6 => Self::ReplyLost,
-            6..9 => Self::LateSubmission { delay: random.between(2_000, 12_000) },
-            9..12 => Self::JobEnds { how: random.below(ENDS.len() as u64) as usize },
-            12 => Self::WaitingJobCancelled,
-            13..15 => Self::FilesLate { until },
-            _ => Self::DirectoryRemoved,
-        }
-    }
-
-    pub fn end(&self, at: Time) -> Time {
-        match self {
-            Self::Away { until } | Self::Full { until } | Self::FilesLate { until } => *until,
-            _ => at,
-        }
-    }
-}
-
-impl fmt::Display for SlurmFault {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let seconds = |time: &Time| *time as f64 / 1000.0;
-        match self {
-            Self::Away { until } => write!(f, "Slurm does not answer until {} s", seconds(until)),
-            Self::Full { until } => write!(f, "Slurm accepts no job until {} s", seconds(until)),
-            Self::ReplyLost => f.write_str("the reply to the next sbatch will be lost"),
-            Self::LateSubmission { delay } => write!(
-                f,
-                "a labeller will be killed during its next sbatch, which submits the job {} s later",
-                seconds(delay)
-            ),
-            Self::JobEnds { how } => write!(f, "a job ends as {}", ENDS[*how].0),
-            Self::WaitingJobCancelled => f.write_str("a job that waits is cancelled"),
-            Self::FilesLate { until } => {
-                write!(f, "files of nodes are seen late until {} s", seconds(until))
-            }
-            Self::DirectoryRemoved => f.write_str("the directory of a calculation is removed"),
-        }
-    }
-}
-
 /// What happens at Slurm, and to labellers that use it.
 #[derive(Clone, Debug)]
 pub enum SlurmEvent {
@@ -466,151 +371,5 @@ impl World {
         self.tell(format!("job {id} of calculation {name} is cancelled"));
         let delay = if is_waiting { 0 } else { self.random.between(200, 3_000) };
         self.after(delay, Event::Slurm(SlurmEvent::Known(id, "CANCELLED")));
-    }
-
-    /// A labeller begins to make a label.
-    pub fn begin_slurm_label(&mut self, id: u32, lease: Box<Lease>, adjustments: BTreeSet<RetryAdjustment>) {
-        let io = self.labeller_io();
-        let exchange = Rc::clone(&io.exchange);
-        self.begin_task(id, SlurmTask { future: Box::pin(io.label(lease, adjustments)), exchange, token: 0 });
-    }
-
-    /// A labeller ends a calculation that is no longer needed.
-    pub fn begin_slurm_stop(&mut self, id: u32, calculation: String) {
-        let io = self.labeller_io();
-        let exchange = Rc::clone(&io.exchange);
-        self.begin_task(id, SlurmTask { future: Box::pin(io.stop(calculation)), exchange, token: 0 });
-    }
-
-    fn labeller_io(&self) -> LabellerIo {
-        LabellerIo {
-            exchange: Rc::new(RefCell::new(Exchange::default())),
-            files: Rc::clone(&self.slurm.files),
-            bug: self.bug,
-        }
-    }
-
-    fn begin_task(&mut self, id: u32, task: SlurmTask) {
-        self.slurm.tasks.insert(id, task);
-        self.task_continues(id, None);
-    }
-
-    /// Gives a labeller the answer to its request, until its next one.
-    fn task_continues(&mut self, id: u32, answer: Option<Answer>) {
-        let Some(mut task) = self.slurm.tasks.remove(&id) else { return };
-        *task.exchange.borrow_mut() = Exchange { request: None, answer };
-        self.slurm.files.borrow_mut().now = self.now;
-        let polled = task.future.as_mut().poll(&mut Context::from_waker(Waker::noop()));
-        let broken = self.slurm.files.borrow_mut().broken.take();
-        if let Some(broken) = broken {
-            return self.fail(broken);
-        }
-        match polled {
-            Poll::Ready(end) => self.labeller_task_ends(id, end),
-            Poll::Pending => {
-                let request = task.exchange.borrow_mut().request.take().expect("it waits for an answer");
-                self.slurm.next_token += 1;
-                task.token = self.slurm.next_token;
-                let token = task.token;
-                self.slurm.tasks.insert(id, task);
-                self.fulfil(id, token, request);
-            }
-        }
-    }
-
-    /// Does what a labeller requests; the answer comes later.
-    fn fulfil(&mut self, id: u32, token: u64, request: Request) {
-        let (now, is_away) = (self.now, self.is_slurm_away());
-        let delay = if is_away { self.random.between(500, 5_000) } else { self.random.between(20, 500) };
-        let (answer, delay) = match request {
-            Request::Sleep(time) => (Answer::Done, time),
-            Request::Ask(_) | Request::List | Request::Cancel(_) if is_away && !self.has_list(&request) => {
-                (Answer::Text(None), delay)
-            }
-            Request::Ask(name) => {
-                let jobs = self.slurm.known(now).filter(|job| job.name == name);
-                (Answer::Text(Some(jobs.map(|job| job.line(now) + "\n").collect())), delay)
-            }
-            Request::List => (Answer::Text(Some(self.list_of_jobs())), delay),
-            Request::Cancel(ids) => {
-                ids.into_iter().for_each(|id| self.cancel_batch_job(id));
-                (Answer::Text(Some(String::new())), delay)
-            }
-            Request::Sbatch(name) => return self.labeller_submits(id, token, name),
-            Request::Take(calculation) => {
-                self.labeller_takes(id, calculation);
-                (Answer::Done, 0)
-            }
-            Request::Record(ref calculation) => match self.labeller_writes_calculation(id, calculation) {
-                Ok(()) => (Answer::Done, 1),
-                Err(error) if error.is_transient() => {
-                    let again = SlurmEvent::Repeats(id, token, request);
-                    return self.after(STORE_RETRY_INTERVAL, Event::Slurm(again));
-                }
-                Err(error) => return self.fail(format!("labeller process {id} fails: {error}")),
-            },
-        };
-        self.after(delay, Event::Slurm(SlurmEvent::Answer(id, token, answer)));
-    }
-
-    fn has_list(&self, request: &Request) -> bool {
-        let recent = |made: Time| self.now < made + SQUEUE_INTERVAL;
-        matches!(request, Request::List) && self.slurm.list.as_ref().is_some_and(|(made, _)| recent(*made))
-    }
-
-    /// The list that labellers share, made again if it is old.
-    fn list_of_jobs(&mut self) -> String {
-        if !self.has_list(&Request::List) {
-            let unfinished = self.slurm.jobs.iter().filter(|job| !job.is_over());
-            let names: Vec<_> = unfinished.map(|job| job.name.as_str()).collect();
-            self.slurm.list = Some((self.now, names.join("\n")));
-        }
-        self.slurm.list.as_ref().map(|(_, names)| names.clone()).unwrap_or_default()
-    }
-
-    /// `sbatch` is under way; it goes on if its labeller is killed.
-    fn labeller_submits(&mut self, id: u32, token: u64, name: String) {
-        let trouble =
-            (!self.slurm.next_submissions.is_empty()).then(|| self.slurm.next_submissions.remove(0));
-        let late = match trouble {
-            Some(SlurmFault::LateSubmission { delay }) => Some(delay),
-            _ => None,
-        };
-        let excluded = match self.slurm.files.borrow().directories.get(&name) {
-            Some(found) if !found.is_removed => Some(found.excluded.clone()),
-            _ => None,
-        };
-        let event = match excluded {
-            Some(excluded) => {
-                let replies = trouble != Some(SlurmFault::ReplyLost);
-                SlurmEvent::Submitted { name, excluded, client: (id, token), replies }
-            }
-            // There is no script.
-            None => SlurmEvent::Answer(id, token, Answer::Text(None)),
-        };
-        let delay = late.unwrap_or_else(|| self.random.between(50, 500));
-        self.after(delay, Event::Slurm(event));
-        if late.is_some() {
-            self.labeller_exits(id, Exit::Killed);
-        }
-    }
-
-    fn labeller_writes_calculation(&mut self, id: u32, calculation: &str) -> Result<(), store::StoreError> {
-        let Some(lease) = self.lease_of(id) else { return Ok(()) };
-        let made = CalculationRecord { cores: Some(1), ..CalculationRecord::default() };
-        self.store.write(self.now, ClientKind::Labeller, "a calculation is recorded", async |store| {
-            store.record_calculation(&lease, calculation, &made).await
-        })
-    }
-
-    fn labeller_task_ends(&mut self, id: u32, end: TaskEnd) {
-        match end {
-            TaskEnd::Result(result, calculation) => self.labeller_has_result(id, result, calculation),
-            TaskEnd::Cleared => self.labeller_is_idle(id),
-            TaskEnd::LabellerFails(why) => {
-                self.tell(format!("labeller process {id} cannot go on: {why}"));
-                self.labeller_fails(id);
-            }
-        }
     }
 }

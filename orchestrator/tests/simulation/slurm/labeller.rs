@@ -18,10 +18,10 @@ use workers::labeller::decisions::{
     jobs_to_cancel,
 };
 
-use super::calculation::CalculationResult;
-use super::fault::Time;
-use super::planted::PlantedBug;
-use super::slurm_files::{CalculationFiles, SETTLE_TIME, SharedFiles};
+use super::super::calculation::CalculationResult;
+use super::super::fault::Time;
+use super::super::planted::PlantedBug;
+use super::files::{CalculationFiles, SETTLE_TIME, SharedFiles};
 
 /// Time between two questions to Slurm.
 pub const SQUEUE_INTERVAL: Time = 20_000;
