@@ -39,6 +39,8 @@ impl ExpectedEnd {
         let left: u64 = under_way.map(left).sum();
         let speed = status.steps_per_second.filter(|speed| status.run_active && *speed > 0.0);
         let walks_hours = match left {
+            // None has begun.
+            _ if status.walks.is_empty() => None,
             0 => Some(0.0),
             left => speed.map(|speed| left as f64 / speed / SECONDS_PER_HOUR),
         };
@@ -75,6 +77,13 @@ mod tests {
             json!({ "walk": { "equilibration_steps": 1_000, "biased_steps": 19_000 } }),
             QueueCost::default(),
         )
+    }
+
+    #[test]
+    fn a_campaign_without_walks_has_no_expected_end() {
+        let (status, configuration, queue) = campaign();
+        let empty = CampaignStatus { walks: Vec::new(), ..status };
+        assert_eq!(ExpectedEnd::extrapolate(&empty, &configuration, &queue).time, None);
     }
 
     #[test]
