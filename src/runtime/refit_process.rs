@@ -7,7 +7,7 @@ use monitor::refit_schedule::BesideWalks;
 use orchestrator::launcher::{ChildEvent, Children, Launch};
 use orchestrator::selector::CampaignMode;
 use orchestrator::supervisor::{ChildState, Limits};
-use store::{ProcessRecord, Store, StoreError, VersionRecord, VersionState, unix_milliseconds};
+use store::{Store, StoreError, VersionRecord, VersionState, unix_milliseconds};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
 use super::RunContext;
@@ -189,7 +189,7 @@ impl<'a> RefitProcess<'a> {
                 let may_start =
                     self.children.is_none() && self.wait_until.is_none_or(|time| Instant::now() >= time);
                 if may_start
-                    && !is_another_running(store).await?
+                    && !store.is_refit_running().await?
                     && let Err(why) = self.start()
                 {
                     self.try_again_later(&why);
@@ -212,7 +212,7 @@ impl<'a> RefitProcess<'a> {
                         log_and_warn(format_args!("refit: {}; {}", ended.reason, ended.then));
                     }
                     // A database that is busy for a moment has the record a little longer.
-                    let _ = remove_dead(self.run.store).await;
+                    let _ = self.run.store.remove_dead_refits().await;
                 }
                 ChildEvent::AllExited => {
                     let failed = how_it_failed(children);
@@ -246,22 +246,6 @@ fn how_it_failed(children: &mut Children) -> Option<RefitEnd> {
 /// When the campaign began, ms since 1970.
 async fn campaign_begin(store: &Store) -> Result<i64, StoreError> {
     Ok(store.operations(0, 1).await?.first().map_or(0, |created| created.time))
-}
-
-/// Whether the user runs a refit by hand.
-async fn is_another_running(store: &Store) -> Result<bool, StoreError> {
-    let refits = store.processes(Some(ProcessRecord::REFITTER)).await?;
-    Ok(refits.iter().any(|found| !found.is_dead()))
-}
-
-/// Removes the records of refits that have ended without doing so.
-async fn remove_dead(store: &Store) -> Result<(), StoreError> {
-    for found in store.processes(Some(ProcessRecord::REFITTER)).await? {
-        if found.is_local() && found.is_dead() {
-            store.remove_process(&found.id).await?;
-        }
-    }
-    Ok(())
 }
 
 /// What a refit of this campaign needs to know.

@@ -202,7 +202,7 @@ impl World {
             return;
         }
         if self.runs[&session].refits.as_ref().is_some_and(RunRefits::walks_are_over) {
-            // Nobody serves agents until the walks of the next version.
+            // Agents are not served until the walks of the next version start.
             return;
         }
         self.runs.get_mut(&session).unwrap().agents.receive(request, &bytes);

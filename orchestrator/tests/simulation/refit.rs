@@ -8,7 +8,7 @@ use monitor::refit_schedule::{AfterWalks, BesideWalks, RefitSchedule};
 use orchestrator::selector::{PotentialVersion, SelectorSettings};
 use orchestrator::supervisor::{ChildState, Limits, Supervisor, SupervisorAction};
 use serde_json::json;
-use store::{ProcessRecord, Store, StoreError, VersionRecord, VersionState};
+use store::{StoreError, VersionRecord, VersionState};
 
 use super::fault::{ClientKind, Time};
 use super::planted::PlantedBug;
@@ -145,7 +145,7 @@ impl World {
             BesideWalks::Superseded => self.walks_make_room(session, true),
             BesideWalks::WalksEnd => self.walks_make_room(session, false),
             BesideWalks::RefitDue if may_start => {
-                let another = self.store.read(now, is_another_running);
+                let another = self.store.read(now, async |store| store.is_refit_running().await);
                 if another.is_ok_and(|another| !another) {
                     self.start_refit(session);
                 }
@@ -291,7 +291,7 @@ impl World {
             supervisor.ended(0, exit.reason(), elapsed);
         }
         // A database that is busy for a moment has the record a little longer.
-        let _ = self.store.read(self.now, remove_dead);
+        let _ = self.store.read(self.now, async |store| store.remove_dead_refits().await);
         self.drive_refit(session);
     }
 
@@ -394,20 +394,4 @@ pub(super) fn refused_version(number: u32, parent: u32, time: i64) -> VersionRec
         core_hours: 0.0,
         time,
     }
-}
-
-/// Whether a refit runs beside that of a run.
-async fn is_another_running(store: &Store) -> Result<bool, StoreError> {
-    let refits = store.processes(Some(ProcessRecord::REFITTER)).await?;
-    Ok(refits.iter().any(|found| !found.is_dead()))
-}
-
-/// Removes the records of refits that have ended without doing so.
-async fn remove_dead(store: &Store) -> Result<(), StoreError> {
-    for found in store.processes(Some(ProcessRecord::REFITTER)).await? {
-        if found.is_local() && found.is_dead() {
-            store.remove_process(&found.id).await?;
-        }
-    }
-    Ok(())
 }

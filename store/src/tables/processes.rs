@@ -55,6 +55,22 @@ impl Store {
         transaction.commit().await
     }
 
+    /// Whether a refit is running: one of a run, or one that the user runs by hand.
+    pub async fn is_refit_running(&self) -> Result<bool> {
+        let refits = self.processes(Some(ProcessRecord::REFITTER)).await?;
+        Ok(refits.iter().any(|found| !found.is_dead()))
+    }
+
+    /// Removes the records of refits that have ended on this host without doing so.
+    pub async fn remove_dead_refits(&self) -> Result<()> {
+        for found in self.processes(Some(ProcessRecord::REFITTER)).await? {
+            if found.is_local() && found.is_dead() {
+                self.remove_process(&found.id).await?;
+            }
+        }
+        Ok(())
+    }
+
     /// Releases leases whose holders are dead or not registered: a process is registered before it leases anything,
     /// and only a dead one loses its record. Does not count as failed attempts. Returns their number.
     pub async fn release_leases_of_dead_processes(&self, now: i64) -> Result<usize> {
