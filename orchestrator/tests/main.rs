@@ -6,6 +6,7 @@ mod batch_plan;
 mod commit_batch;
 mod completion;
 mod decisions;
+mod forgetting;
 mod nothing_new;
 mod reactor;
 mod replay;
