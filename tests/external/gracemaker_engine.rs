@@ -102,7 +102,8 @@ fn a_biased_step_is_that_of_gracemaker() {
         let python = PythonModel::local(vec![device]).unwrap().projected(projection).unwrap();
         let python: Arc<dyn ModelWithFeatures> = Arc::new(python);
         assert_eq!(native.elements(), python.elements());
-        for frame in read_extxyz(&here.join("frames.extxyz")).unwrap().iter().take(4) {
+        // One with copper and one without. XLA compiles anew for each number of bonds, which takes most of this test.
+        for frame in read_extxyz(&here.join("frames.extxyz")).unwrap().iter().take(2) {
             let [ours, theirs] =
                 [&native, &python].map(|model| step(Arc::clone(model), &mixture, &frame.structure));
             let pairs = [

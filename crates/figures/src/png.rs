@@ -44,8 +44,9 @@ fn encode(pixmap: &Pixmap, dots_per_inch: f64) -> Result<Vec<u8>, PngError> {
     let per_metre = (dots_per_inch / METRES).round() as u32;
     let unit = png::Unit::Meter;
     encoder.set_pixel_dims(Some(png::PixelDimensions { xppu: per_metre, yppu: per_metre, unit }));
-    // The white background is opaque.
-    let colours: Vec<u8> = pixmap.pixels().iter().flat_map(|p| [p.red(), p.green(), p.blue()]).collect();
+    // Red, green, blue and opacity: the white background is opaque.
+    let mut colours = Vec::with_capacity(pixmap.data().len() / 4 * 3);
+    pixmap.data().chunks_exact(4).for_each(|pixel| colours.extend_from_slice(&pixel[..3]));
     encoder.write_header()?.write_image_data(&colours)?;
     Ok(bytes)
 }
