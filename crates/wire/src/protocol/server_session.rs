@@ -238,3 +238,103 @@ impl<T: ServerTransport> ServerSession<T> {
         self.mixtures.values()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::datagram::{DatagramServer, DatagramWalker, OfferAnswer};
+    use super::super::frame;
+    use super::*;
+    use crate::control::encode;
+
+    const SENDER: SenderId = SenderId { session: 7, walker: 3, incarnation: 1 };
+
+    /// A server that expects the first process of walker 3, and that process.
+    fn both_ends() -> (DatagramServer, DatagramWalker) {
+        let mut server = DatagramServer::new(SENDER.session);
+        server.expect(SENDER.walker, SENDER.incarnation);
+        let walker = DatagramWalker::new(SENDER.session, SENDER.walker, SENDER.incarnation);
+        (server, walker)
+    }
+
+    fn message(payload: Payload<'_>) -> Vec<u8> {
+        frame::with_block(&encode(&Envelope { sender: SENDER, payload }), None)
+    }
+
+    /// The answers that a walker has got.
+    fn answers(server: &mut DatagramServer, walker: &DatagramWalker) -> Vec<OfferAnswer> {
+        server.answer_decided(|_| {});
+        let answers = server.take_answers();
+        answers.iter().filter_map(|answer| walker.receive(&answer.bytes).unwrap()).collect()
+    }
+
+    #[test]
+    fn an_offer_is_forwarded_once_and_answered_when_it_is_decided() {
+        let (mut server, mut walker) = both_ends();
+        walker.begin_offer(None);
+        server.receive(&walker.poll()).unwrap();
+        assert!(matches!(answers(&mut server, &walker)[..], [OfferAnswer::Unknown]), "it was lost");
+        for _ in 0..2 {
+            server.receive(&walker.offer()).unwrap();
+        }
+        let mut incoming = server.take_incoming();
+        let Some(Incoming::Idle { walker: 3, report: None, reply }) = incoming.pop() else { panic!() };
+        assert!(incoming.is_empty() && answers(&mut server, &walker).is_empty());
+        server.receive(&walker.poll()).unwrap();
+        assert!(matches!(answers(&mut server, &walker)[..], [OfferAnswer::Pending]));
+        reply.send(None).unwrap();
+        assert!(matches!(answers(&mut server, &walker)[..], [OfferAnswer::Shutdown]));
+        for question in [walker.poll(), walker.offer()] {
+            server.receive(&question).unwrap();
+            assert!(matches!(answers(&mut server, &walker)[..], [OfferAnswer::Shutdown]), "it is repeated");
+        }
+        assert!(server.take_incoming().is_empty());
+    }
+
+    #[test]
+    fn only_the_end_of_the_current_process_is_a_loss() {
+        let (mut server, mut walker) = both_ends();
+        walker.begin_offer(None);
+        server.receive(&walker.offer()).unwrap();
+        let Some(Incoming::Idle { reply, .. }) = server.take_incoming().pop() else { panic!() };
+        server.process_ended(SENDER.walker, SENDER.incarnation + 1, true);
+        assert!(server.take_incoming().is_empty());
+        server.process_ended(SENDER.walker, SENDER.incarnation, true);
+        assert!(matches!(server.take_incoming()[..], [Incoming::Lost { walker: 3, crashed: true }]));
+        // The reactor learns that its decision reaches nobody.
+        assert!(reply.send(None).is_err());
+        assert!(server.receive(&walker.poll()).is_err());
+        server.expect(SENDER.walker, SENDER.incarnation + 1);
+        assert!(server.receive(&walker.offer()).is_err(), "a message of the process before");
+        // A successor that comes first makes it a loss as well.
+        server.expect(SENDER.walker, SENDER.incarnation + 2);
+        assert!(matches!(server.take_incoming()[..], [Incoming::Lost { walker: 3, crashed: false }]));
+    }
+
+    #[test]
+    fn a_candidate_without_a_report_is_rejected() {
+        let (mut server, _) = both_ends();
+        let offer =
+            encode(&Envelope { sender: SENDER, payload: Payload::Offer { sequence: 1, report: None } });
+        assert!(server.receive(&frame::with_block(&offer, Some(&[7; 8]))).is_err());
+        assert!(server.take_incoming().is_empty());
+    }
+
+    #[test]
+    fn progress_that_nobody_takes_is_dropped() {
+        let (mut server, mut walker) = both_ends();
+        let progress = |step| {
+            message(Payload::Progress(WalkId(5), Cow::Owned(WalkProgress { step, ..Default::default() })))
+        };
+        for step in 0..MAX_QUEUED_PROGRESS as u64 + 9 {
+            server.receive(&progress(step)).unwrap();
+        }
+        walker.begin_offer(None);
+        server.receive(&walker.offer()).unwrap();
+        let mut incoming = server.take_incoming();
+        assert!(matches!(incoming.pop(), Some(Incoming::Idle { .. })), "an offer is not dropped");
+        assert_eq!(incoming.len(), MAX_QUEUED_PROGRESS);
+        for (step, one) in (0..).zip(&incoming) {
+            assert!(matches!(one, Incoming::Progress(WalkId(5), of) if of.step == step));
+        }
+    }
+}
