@@ -200,6 +200,11 @@ impl SharedFiles {
         if std::mem::replace(&mut found.is_removed, true) || found.is_damaged {
             return;
         }
+        // A job whose id was lost cannot be cancelled. What it computes is lost with its directory.
+        if matches!(why, Removal::Lost { .. }) && found.submissions.values().any(|(id, _)| id.is_none()) {
+            found.is_running = false;
+            return;
+        }
         let has_result = found.truth.is_some_and(|truth| truth != Err(FailureClass::NodeFailure));
         let is_left = has_result && !found.is_delivered;
         let is_needed = match why {

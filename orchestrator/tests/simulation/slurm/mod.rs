@@ -183,6 +183,9 @@ impl World {
                 let found = files.directories.iter_mut().find(|(_, found)| !found.is_removed);
                 if let Some((name, found)) = found {
                     (found.is_removed, found.is_damaged) = (true, true);
+                    // Slurm knows a job by its name; ids of other jobs are gone with the directory, and what they compute is
+                    // lost.
+                    found.is_running &= slurm.dialect.is_none();
                     let sentence = format!("the directory of {name} is gone");
                     drop(files);
                     self.tell(sentence);
