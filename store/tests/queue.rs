@@ -66,6 +66,9 @@ async fn the_first_result_becomes_the_label() {
     assert_eq!(store.fail(&holds, "timeout", "", LIMIT, 14_000).await.unwrap(), FailOutcome::LeaseLost);
     assert_eq!(state(&store, &names[0]).await, JobState::Labelled);
 
+    let attempts = store.queue_show(&names[0]).await.unwrap().attempts_made;
+    let outcomes: Vec<_> = attempts.iter().map(|attempt| attempt.outcome.as_deref().unwrap()).collect();
+    assert_eq!(outcomes, ["labelled", "check"]);
     let history = store.labels_of(ContentHash::from_structure(&holds.structure)).await.unwrap();
     let lines: Vec<_> =
         history.iter().map(|label| (label.record.status, label.record.label.energy)).collect();

@@ -185,9 +185,9 @@ impl PlantedBug {
             Self::AgentLossForgotten => AGENT_SEEDS,
             Self::LateReplyBelieved | Self::OldSlotsKept => AGENT_SEEDS + 1,
             Self::RefusalForgotten | Self::WantedRemoved => CUSTOM_SEEDS,
-            Self::AssignmentDealtTwice | Self::NewestMixture | Self::SessionOfAllVersions => {
-                self.first_seed()
-            }
+            Self::AssignmentDealtTwice => AGENT_SEEDS,
+            Self::NewestMixture => AGENT_SEEDS + 15,
+            Self::SessionOfAllVersions => REFIT_SEEDS + 35,
             Self::AgentIdReused | Self::RefitAbandoned | Self::RefusedVersionTakenUp => self.first_seed(),
             Self::VersionLimitForgotten | Self::VersionRecordedTwice | Self::OldWalksContinue => {
                 REFIT_SEEDS + 1

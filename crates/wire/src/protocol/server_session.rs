@@ -241,10 +241,17 @@ impl<T: ServerTransport> ServerSession<T> {
 
 #[cfg(test)]
 mod tests {
+    use std::task::Waker;
+
+    use atoms::{Cell, Structure};
+
     use super::super::datagram::{DatagramServer, DatagramWalker, OfferAnswer};
     use super::super::frame;
     use super::*;
+    use crate::block::Candidate;
     use crate::control::encode;
+    use crate::ids::{CampaignId, CandidateId, ContentHash, Origin};
+    use crate::messages::Outcome;
 
     const SENDER: SenderId = SenderId { session: 7, walker: 3, incarnation: 1 };
 
@@ -336,5 +343,97 @@ mod tests {
         for (step, one) in (0..).zip(&incoming) {
             assert!(matches!(one, Incoming::Progress(WalkId(5), of) if of.step == step));
         }
+    }
+
+    /// A candidate of one atom.
+    fn candidate() -> Candidate {
+        let structure = Structure {
+            species: vec!["Al".parse().unwrap()],
+            positions: vec![[0.5, 0.0, 0.0]],
+            cell: Cell::orthorhombic(4.0, 4.0, 4.0),
+            periodic: [true; 3],
+        };
+        let content = ContentHash::from_structure(&structure);
+        Candidate {
+            id: CandidateId { campaign: CampaignId([1; 16]), walk: WalkId(5), segment: 0, step: 8, content },
+            origin: Origin::Biased,
+            mixture_version: 2,
+            temperature: 300.0,
+            relative_volume: 1.0,
+            energy: -1.5,
+            virial: [[0.0; 3]; 3],
+            structure,
+            forces: vec![[0.25, 0.0, 0.0]],
+            gamma: vec![1.5],
+            gamma_nbr: vec![1.25],
+            features: vec![0.5, 0.75],
+        }
+    }
+
+    #[test]
+    fn a_candidate_arrives_with_its_report() {
+        let (mut server, mut walker) = both_ends();
+        let report = AssignmentReport {
+            walk: WalkId(5),
+            assignment: 4,
+            start: None,
+            outcome: Outcome::Candidate(candidate()),
+            checkpoint: vec![7],
+            progress: WalkProgress::default(),
+            trace: Vec::new(),
+            frames: Vec::new(),
+        };
+        walker.begin_offer(Some(report));
+        assert_eq!(server.receive(&walker.offer()).unwrap(), (SENDER.walker, true));
+        let Some(Incoming::Idle { report: Some(report), .. }) = server.take_incoming().pop() else {
+            panic!()
+        };
+        let Outcome::Candidate(block) = report.outcome else { panic!() };
+        assert_eq!((report.assignment, block.view().to_candidate()), (4, candidate()));
+    }
+
+    /// A transport that keeps what is sent: the number of the request, and the answer.
+    #[derive(Default)]
+    struct Kept(Vec<(u32, Vec<u8>)>);
+
+    impl ServerTransport for Kept {
+        type Request = u32;
+
+        const HOLDS_POLLS: bool = true;
+
+        fn encode(answer: Answer<'_>) -> Vec<u8> {
+            encode(&answer)
+        }
+
+        fn send(&mut self, _: SenderId, request: &u32, answer: &[u8]) {
+            self.0.push((*request, answer.to_vec()));
+        }
+
+        fn candidate(&mut self, _: SenderId, _: &u32, block: &[u8]) -> Result<CandidateBlock, BlockError> {
+            CandidateBlock::from_bytes(block)
+        }
+    }
+
+    /// With a transport that holds polls, the latest request about an offer gets the answer, once.
+    #[test]
+    fn a_loss_is_forwarded_before_the_next_offer() {
+        let mut session = ServerSession::new(SENDER.session, Kept::default());
+        session.expect(SENDER.walker, SENDER.incarnation);
+        for request in [1, 2] {
+            session.receive_loss(SENDER, 1, true, &request).unwrap();
+        }
+        let poll = Envelope { sender: SENDER, payload: Payload::Poll { sequence: 1 } };
+        session.receive(poll, &3, &[]).unwrap();
+        let mut incoming: Vec<_> = session.outbox.drain(..).collect();
+        let Some(Incoming::Idle { walker: 3, report: None, reply }) = incoming.pop() else { panic!() };
+        assert!(matches!(incoming[..], [Incoming::Lost { walker: 3, crashed: true }]), "once");
+        assert!(session.transport.0.is_empty());
+        reply.send(None).unwrap();
+        let mut context = Context::from_waker(Waker::noop());
+        let Poll::Ready(decision) = session.poll_decision(&mut context) else { panic!() };
+        session.answer(decision);
+        assert!(session.poll_decision(&mut context).is_pending());
+        assert_eq!(session.transport.0.iter().map(|(request, _)| *request).collect::<Vec<_>>(), [3]);
+        assert!(session.receive_loss(SENDER, 3, true, &4).is_err(), "out of order");
     }
 }

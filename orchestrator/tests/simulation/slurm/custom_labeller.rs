@@ -18,7 +18,7 @@ use super::labeller::{Answer, FULL_PAUSES, Failing, LabellerIo, POLL_INTERVALS, 
 /// Time between two questions about a job.
 const QUESTION_INTERVAL: Time = 30_000;
 /// Time within which a job ends after it has begun.
-const TIME_LIMIT: Duration = Duration::from_secs(60);
+const TIME_LIMIT: Duration = Duration::from_secs(90);
 /// How long a cancelled job may take to end.
 const CANCEL_TIMEOUT: Time = 5_000;
 

@@ -321,7 +321,9 @@ impl World {
         (found.begun, found.begun_by, found.is_running) = (Some((now, now + delay)), submission, true);
         found.is_damaged |= delay > SETTLE_TIME;
         let number = found.job;
-        let longest = if self.random.happens(30) { 40_000 } else { 15_000 };
+        // Labellers ask other batch systems less often.
+        let long = if is_singleton { 40_000 } else { 70_000 };
+        let longest = if self.random.happens(30) { long } else { 15_000 };
         let time = self.random.between(3_000, longest);
         self.tell(format!("job {id} of calculation {name} begins on {node}"));
         let others = files.directories.values().filter(|other| other.job == number && other.is_running);
