@@ -516,6 +516,8 @@ async fn the_cost_of_a_calculation_is_counted_once() {
     assert_eq!(store.lease_status(&third).await.unwrap(), LeaseStatus::LeasedAgain { calculation: None });
     assert_eq!(store.lease_status(&fourth).await.unwrap(), LeaseStatus::Held);
     assert_eq!(store.lease_status(&second).await.unwrap(), LeaseStatus::Over);
+    store.record_calculation(&fourth, "elsewhere", &made).await.unwrap();
+    assert_eq!(core_seconds(9000).await, 19.5, "another calculation costs what it has cost");
 }
 
 #[tokio::test]
@@ -614,6 +616,9 @@ async fn a_calculation_does_not_fail_with_its_labeller() {
     let attempt = &details.attempts_made[0];
     assert_eq!((attempt.outcome.as_deref(), attempt.class.as_deref()), (Some("lost"), None));
     assert_eq!(lease(&store, "h", 2).await.unwrap().earlier_calculations, ["here"]);
+    // The calculation of an earlier attempt says nothing about this one.
+    assert_eq!(store.fail_leases_of("h", "crashed", "SIGSEGV", 1, 3).await.unwrap(), 1);
+    assert_eq!(state(&store, &names[0]).await, JobState::Failed);
 }
 
 /// An attempt knows the failures since the job was last requeued by hand, and every calculation that failed.
@@ -635,7 +640,8 @@ async fn an_attempt_knows_what_has_failed() {
         assert_eq!(fail(number, class).await, FailOutcome::Requeued);
     }
     // A loss without a reason is none.
-    lease(&store, "h", 0).await.unwrap();
+    let lost = lease(&store, "h", 0).await.unwrap();
+    store.record_calculation(&lost, "calculation 4", &CalculationRecord::default()).await.unwrap();
     store.release_all("h", 1).await.unwrap();
     let fourth = lease(&store, "h", 0).await.unwrap();
     assert_eq!(fourth.failures, ["not_converged", "node_failure", "out_of_memory"]);

@@ -185,7 +185,7 @@ impl PlantedBug {
             Self::AgentLossForgotten => AGENT_SEEDS,
             Self::LateReplyBelieved | Self::OldSlotsKept => AGENT_SEEDS + 1,
             Self::RefusalForgotten => CUSTOM_SEEDS + 195,
-            Self::WantedRemoved => CUSTOM_SEEDS + 73,
+            Self::WantedRemoved => CUSTOM_SEEDS + 90,
             Self::AssignmentDealtTwice => AGENT_SEEDS,
             Self::NewestMixture => AGENT_SEEDS + 15,
             Self::SessionOfAllVersions => REFIT_SEEDS + 35,
