@@ -53,7 +53,7 @@ pub struct CalculationFiles {
 
 /// Why a directory is removed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Removal {
+pub enum DirectoryRemoval {
     /// The store has the result.
     Delivered,
     /// Nobody needs the result.
@@ -195,24 +195,28 @@ impl SharedFiles {
     }
 
     /// Removes a directory. Its calculation must not run, and its result must be delivered or lost.
-    pub fn remove(&mut self, name: &str, why: Removal) {
+    pub fn remove(&mut self, name: &str, why: DirectoryRemoval) {
         let Some(found) = self.directories.get_mut(name) else { return };
         if std::mem::replace(&mut found.is_removed, true) || found.is_damaged {
             return;
         }
         // A job whose id was lost cannot be cancelled. What it computes is lost with its directory.
-        if matches!(why, Removal::Lost { .. }) && found.submissions.values().any(|(id, _)| id.is_none()) {
+        if matches!(why, DirectoryRemoval::Lost { .. })
+            && found.submissions.values().any(|(id, _)| id.is_none())
+        {
             found.is_running = false;
             return;
         }
         let has_result = found.truth.is_some_and(|truth| truth != Err(FailureClass::NodeFailure));
         let is_left = has_result && !found.is_delivered;
         let is_needed = match why {
-            Removal::NotNeeded | Removal::OtherProgram => return,
+            DirectoryRemoval::NotNeeded | DirectoryRemoval::OtherProgram => return,
             // What runs is cancelled, if its id is known.
-            Removal::Lost { has_newer: true } => return,
-            Removal::LeftOver => found.is_running || is_left && !found.is_unwanted,
-            Removal::Delivered | Removal::Lost { has_newer: false } => found.is_running || is_left,
+            DirectoryRemoval::Lost { has_newer: true } => return,
+            DirectoryRemoval::LeftOver => found.is_running || is_left && !found.is_unwanted,
+            DirectoryRemoval::Delivered | DirectoryRemoval::Lost { has_newer: false } => {
+                found.is_running || is_left
+            }
         };
         if is_needed {
             let running = if found.is_running { "runs" } else { "is not delivered" };

@@ -22,7 +22,7 @@ use super::super::calculation::CalculationResult;
 use super::super::fault::Time;
 use super::super::planted::PlantedBug;
 use super::dialect::Dialect;
-use super::files::{CalculationFiles, Removal, SharedFiles};
+use super::files::{CalculationFiles, DirectoryRemoval, SharedFiles};
 
 /// Time between two tries of a submission.
 pub(super) const RETRY_INTERVAL: Time = 3_000;
@@ -151,7 +151,7 @@ impl LabellerIo {
     }
 
     /// Ends what is left of a calculation and removes its directory.
-    async fn clear(&self, name: &str, why: Removal) -> Failing<()> {
+    async fn clear(&self, name: &str, why: DirectoryRemoval) -> Failing<()> {
         match &self.dialect {
             Some(dialect) => self.cancel_custom(dialect, name).await?,
             None => self.cancel_slurm(name).await?,
@@ -168,7 +168,9 @@ impl LabellerIo {
             let state = self.inspect(name).await?;
             match state.of_earlier(found.is_some()) {
                 EarlierStep::Leave => {}
-                EarlierStep::Clear => self.clear(name, Removal::Lost { has_newer: found.is_some() }).await?,
+                EarlierStep::Clear => {
+                    self.clear(name, DirectoryRemoval::Lost { has_newer: found.is_some() }).await?
+                }
                 EarlierStep::Take => {
                     let is_ready = state == CalculationState::Ready;
                     if is_ready {
@@ -200,7 +202,7 @@ impl LabellerIo {
             self.submit(&name).await?;
         }
         let Some(end) = self.wait(&name).await? else {
-            self.clear(&name, Removal::Lost { has_newer: false }).await?;
+            self.clear(&name, DirectoryRemoval::Lost { has_newer: false }).await?;
             return Ok(TaskEnd::Result(CalculationResult::Failure(FailureClass::NodeFailure), None));
         };
         let result = self.read(&name, &end);
@@ -208,7 +210,7 @@ impl LabellerIo {
         let result = match result {
             Ok(energy) => CalculationResult::Label(energy),
             Err(FailureClass::OtherProgram) => {
-                self.files.borrow_mut().remove(&name, Removal::OtherProgram);
+                self.files.borrow_mut().remove(&name, DirectoryRemoval::OtherProgram);
                 return Err("another program has calculated".to_owned());
             }
             Err(class) => {
@@ -266,7 +268,7 @@ impl LabellerIo {
                 _ => past,
             };
             if is_left_over(&past, state.as_ref()) {
-                self.files.borrow_mut().remove(&name, Removal::LeftOver);
+                self.files.borrow_mut().remove(&name, DirectoryRemoval::LeftOver);
             }
         }
         Ok(())
@@ -287,7 +289,7 @@ impl LabellerIo {
 
     /// Ends a calculation that is no longer needed.
     pub async fn stop(self, name: String) -> TaskEnd {
-        match self.clear(&name, Removal::NotNeeded).await {
+        match self.clear(&name, DirectoryRemoval::NotNeeded).await {
             Ok(()) => TaskEnd::Cleared,
             Err(why) => TaskEnd::LabellerFails(why),
         }

@@ -13,7 +13,7 @@ use store::records::Lease;
 use super::super::event::{Event, Exit};
 use super::super::fault::{ClientKind, Time};
 use super::super::world::World;
-use super::files::Removal;
+use super::files::DirectoryRemoval;
 use super::labeller::{Answer, Exchange, LabellerIo, Request, SlurmTask, TaskEnd};
 use super::slurm_labeller::SQUEUE_INTERVAL;
 use super::{SlurmEvent, SlurmFault};
@@ -143,7 +143,7 @@ impl World {
     /// Removes the directory of a calculation whose result is delivered.
     pub fn remove_directory(&mut self, calculation: &str) {
         let mut files = self.slurm.files.borrow_mut();
-        files.remove(calculation, Removal::Delivered);
+        files.remove(calculation, DirectoryRemoval::Delivered);
         let broken = files.broken.take();
         drop(files);
         broken.into_iter().for_each(|broken| self.fail(broken));
