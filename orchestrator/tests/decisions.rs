@@ -83,6 +83,7 @@ fn each_candidate_has_three_grades() {
         // The two atoms are bonded, so the average lies between their grades.
         assert!(candidate.original.gamma_nbr.iter().all(|gamma| 0.0 < *gamma && *gamma < z));
         assert_eq!(detail["walker"]["atoms_above_1"], 1);
+        assert!(detail.get("raised_by").is_none(), "the threshold is not raised");
     }
     assert_eq!(second.decisions[0].detail["selector"]["mixture_version"], 1);
     let (seen, newest) =

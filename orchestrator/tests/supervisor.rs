@@ -178,6 +178,17 @@ fn unresponsive_children_are_killed_once_and_restarted() {
     }
 }
 
+/// It may have ended by itself just before it was killed.
+#[test]
+fn a_child_that_ends_before_it_is_killed_has_ended_by_itself() {
+    let mut supervisor = started(2);
+    supervisor.due_actions(s(120));
+    let ended = supervisor.ended(0, finished(), s(121)).unwrap();
+    assert_eq!((ended.reason, ended.then), (finished(), ChildState::Exited));
+    let ended = supervisor.ended(1, signal(11), s(121)).unwrap();
+    assert_eq!((ended.reason, ended.then), (signal(11), ChildState::BackingOff { left: s(1) }));
+}
+
 #[test]
 fn missed_heartbeats_during_a_suspension_do_not_count() {
     let mut supervisor = started(1);
@@ -190,6 +201,10 @@ fn missed_heartbeats_during_a_suspension_do_not_count() {
         [SupervisorAction::Kill { number: 0 }],
         "a little late is no excuse"
     );
+    let mut supervisor = started(1);
+    assert_eq!(supervisor.due_actions(s(132)).len(), 1, "a tenth of the time is a little");
+    let mut supervisor = started(1);
+    assert_eq!(supervisor.due_actions(s(133)), []);
 }
 
 #[test]

@@ -66,6 +66,9 @@ async fn the_first_result_becomes_the_label() {
     assert_eq!(store.fail(&holds, "timeout", "", LIMIT, 14_000).await.unwrap(), FailOutcome::LeaseLost);
     assert_eq!(state(&store, &names[0]).await, JobState::Labelled);
 
+    let attempts = store.queue_show(&names[0]).await.unwrap().attempts_made;
+    let outcomes: Vec<_> = attempts.iter().map(|attempt| attempt.outcome.as_deref().unwrap()).collect();
+    assert_eq!(outcomes, ["labelled", "check"]);
     let history = store.labels_of(ContentHash::from_structure(&holds.structure)).await.unwrap();
     let lines: Vec<_> =
         history.iter().map(|label| (label.record.status, label.record.label.energy)).collect();
@@ -513,6 +516,8 @@ async fn the_cost_of_a_calculation_is_counted_once() {
     assert_eq!(store.lease_status(&third).await.unwrap(), LeaseStatus::LeasedAgain { calculation: None });
     assert_eq!(store.lease_status(&fourth).await.unwrap(), LeaseStatus::Held);
     assert_eq!(store.lease_status(&second).await.unwrap(), LeaseStatus::Over);
+    store.record_calculation(&fourth, "elsewhere", &made).await.unwrap();
+    assert_eq!(core_seconds(9000).await, 19.5, "another calculation costs what it has cost");
 }
 
 #[tokio::test]
@@ -571,4 +576,103 @@ async fn leases_that_a_holder_does_not_state_are_released() {
     assert_eq!(store.state_leases("a", &[&known, &unknown], 3).await.unwrap(), 1);
     assert_eq!(store.state_leases("a", &[], 3).await.unwrap(), 1);
     assert_eq!((store.state_leases("a/0", &[&part], 3).await.unwrap(), details.job.failures), (0, 0));
+}
+
+/// A labeller that has lost its lease finds out what became of the job, and decides nothing about it any more.
+#[tokio::test]
+async fn who_has_lost_a_lease_decides_nothing() {
+    let database = TestDatabase::new();
+    let store = database.create().await;
+    let names = accept(&store, 1).await;
+    let lost = lease(&store, "a", 0).await.unwrap();
+    assert_eq!(store.release_all("a", 1).await.unwrap(), 1);
+    assert_eq!(store.lease_status(&lost).await.unwrap(), LeaseStatus::Queued);
+    // Neither while the job waits nor while another one has it.
+    for (number, holder) in [(0, None), (1, Some("b"))] {
+        if let Some(holder) = holder {
+            lease(&store, holder, 2).await.unwrap();
+        }
+        let released = store.release_lost(&lost, "node_failure", "gone", 3).await.unwrap();
+        assert_eq!(released, FailOutcome::LeaseLost);
+        let job = store.queue_show(&names[0]).await.unwrap().job;
+        let expected = if number == 0 { JobState::Queued } else { JobState::Leased };
+        assert_eq!((job.state, job.holder.as_deref()), (expected, holder));
+    }
+    let unknown = Lease { job: 99, ..lost };
+    assert!(matches!(store.lease_status(&unknown).await, Err(StoreError::UnknownJob { .. })));
+}
+
+/// The crash of a labeller counts only for what it did itself: a calculation goes on without it.
+#[tokio::test]
+async fn a_calculation_does_not_fail_with_its_labeller() {
+    let database = TestDatabase::new();
+    let store = database.create().await;
+    let names = accept(&store, 1).await;
+    let first = lease(&store, "h", 0).await.unwrap();
+    store.record_calculation(&first, "here", &CalculationRecord::default()).await.unwrap();
+    assert_eq!(store.fail_leases_of("h", "crashed", "SIGSEGV", 1, 1).await.unwrap(), 1);
+    let details = store.queue_show(&names[0]).await.unwrap();
+    assert_eq!((details.job.state, details.job.failures), (JobState::Queued, 0));
+    let attempt = &details.attempts_made[0];
+    assert_eq!((attempt.outcome.as_deref(), attempt.class.as_deref()), (Some("lost"), None));
+    assert_eq!(lease(&store, "h", 2).await.unwrap().earlier_calculations, ["here"]);
+    // The calculation of an earlier attempt says nothing about this one.
+    assert_eq!(store.fail_leases_of("h", "crashed", "SIGSEGV", 1, 3).await.unwrap(), 1);
+    assert_eq!(state(&store, &names[0]).await, JobState::Failed);
+}
+
+/// An attempt knows the failures since the job was last requeued by hand, and every calculation that failed.
+#[tokio::test]
+async fn an_attempt_knows_what_has_failed() {
+    let database = TestDatabase::new();
+    let store = database.create().await;
+    let names = accept(&store, 1).await;
+    let fail = async |number: u32, class: &str| {
+        let lease = lease(&store, "h", 0).await.unwrap();
+        let calculation = format!("calculation {number}");
+        store.record_calculation(&lease, &calculation, &CalculationRecord::default()).await.unwrap();
+        match class {
+            "node_failure" => store.release_lost(&lease, class, "gone", 1).await.unwrap(),
+            _ => store.fail(&lease, class, "log", 3, 1).await.unwrap(),
+        }
+    };
+    for (number, class) in [(1, "not_converged"), (2, "node_failure"), (3, "out_of_memory")] {
+        assert_eq!(fail(number, class).await, FailOutcome::Requeued);
+    }
+    // A loss without a reason is none.
+    let lost = lease(&store, "h", 0).await.unwrap();
+    store.record_calculation(&lost, "calculation 4", &CalculationRecord::default()).await.unwrap();
+    store.release_all("h", 1).await.unwrap();
+    let fourth = lease(&store, "h", 0).await.unwrap();
+    assert_eq!(fourth.failures, ["not_converged", "node_failure", "out_of_memory"]);
+    let all = |last: u32| (1..=last).map(|number| format!("calculation {number}")).collect::<Vec<_>>();
+    assert_eq!(fourth.failed_calculations, all(3));
+    assert_eq!(store.fail(&fourth, "crashed", "log", 3, 1).await.unwrap(), FailOutcome::Failed);
+    store.retry_job(&names[0], 2).await.unwrap();
+    let fifth = lease(&store, "h", 0).await.unwrap();
+    assert_eq!((fifth.failures.len(), fifth.overruled), (0, true));
+    store.release_all("h", 3).await.unwrap();
+    assert_eq!(fail(7, "time_limit").await, FailOutcome::Requeued);
+    let last = lease(&store, "h", 0).await.unwrap();
+    assert_eq!(last.failures, ["time_limit"]);
+    assert_eq!(last.failed_calculations, [all(3), vec!["calculation 7".to_owned()]].concat());
+}
+
+#[tokio::test]
+async fn nothing_is_pending_in_an_empty_queue() {
+    let database = TestDatabase::new();
+    let store = database.create().await;
+    assert!(!store.has_pending_labels(0).await.unwrap());
+    assert!(!store.all_walks_ended().await.unwrap(), "no walk has begun");
+    accept(&store, 1).await;
+    assert!(store.has_pending_labels(0).await.unwrap());
+    let with_state = |number, state: &str| store::WalkRecord { state: state.into(), ..walk(number, 1) };
+    for (state, ended) in [("waiting", false), ("running", false), ("completed", true)] {
+        let commit = store::Commit {
+            walks: vec![with_state(0, "completed"), with_state(1, state)],
+            ..Default::default()
+        };
+        store.commit(&commit).await.unwrap();
+        assert_eq!(store.all_walks_ended().await.unwrap(), ended, "{state}");
+    }
 }

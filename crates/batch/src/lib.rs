@@ -11,7 +11,9 @@ mod job_phase;
 mod quoted;
 mod slurm;
 
-pub use custom::{CustomClient, CustomError, CustomScheduler, JobRequest, LogTexts, PolledState, StateWords};
+pub use custom::{
+    CommandOutput, CustomClient, CustomError, CustomScheduler, JobRequest, LogTexts, PolledState, StateWords,
+};
 pub use job_id::JobId;
 pub use job_phase::JobPhase;
 pub use quoted::quoted;

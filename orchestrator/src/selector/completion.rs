@@ -76,3 +76,15 @@ fn predictors(graded: &RegradedCandidate) -> Option<CompletionPredictors> {
     let gamma = maximum(&graded.original.gamma);
     CompletionPredictors::of_structure(&view.structure(), gamma, Some(view.relative_volume())).ok()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_limit_itself_is_probable_enough() {
+        for (probability, declines) in [(0.49, true), (0.5, false), (0.51, false)] {
+            assert_eq!(CompletionCheck { probability, min_probability: 0.5 }.declines(), declines);
+        }
+    }
+}

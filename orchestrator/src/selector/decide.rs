@@ -511,3 +511,34 @@ pub(super) fn update_summary(outcome: &UpdateOutcome) -> serde_json::Value {
         "components": places,
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use calm::UpdateRule;
+    use calm::rules::MaximumGradeUpdate;
+
+    use super::*;
+
+    #[test]
+    fn atoms_count_whose_grade_exceeds_one() {
+        let summary = grade_summary(&[0.5, 1.0, 1.5, 2.0, 3.0], 7);
+        assert_eq!(summary, json!({ "gamma_max": 3.0, "atoms_above_1": 3, "mixture_version": 7 }));
+    }
+
+    #[test]
+    fn updates_are_additive_once_the_store_says_so() {
+        let configured = UpdateSettings {
+            covariance_update: CovarianceUpdateKind::Convex,
+            alpha_values: None,
+            stop: UpdateRule::MaximumGrade(MaximumGradeUpdate { target: 1.25.try_into().unwrap() }),
+        };
+        let kind = |name: &str, value: &str| {
+            let values = [("round".to_owned(), "3".to_owned()), (name.to_owned(), value.to_owned())];
+            update_settings_in_force(&configured, &values).covariance_update
+        };
+        assert_eq!(kind(ADDITIVE, "1"), CovarianceUpdateKind::Additive);
+        for (name, value) in [(ADDITIVE, "0"), ("left_out", "1")] {
+            assert_eq!(kind(name, value), CovarianceUpdateKind::Convex, "{name}");
+        }
+    }
+}

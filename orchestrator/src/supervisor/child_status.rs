@@ -51,3 +51,24 @@ pub struct ChildStatus {
     /// The last failure.
     pub last_failure: Option<ExitReason>,
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn states_are_displayed() {
+        let backing_off = ChildState::BackingOff { left: Duration::from_millis(1_200) };
+        let shown = [
+            (ChildState::Starting, "starting"),
+            (ChildState::Running, "running"),
+            (backing_off, "backing off for 2 s"),
+            (ChildState::Stopping, "stopping"),
+            (ChildState::Exited, "exited"),
+            (ChildState::Failed, "failed"),
+        ];
+        for (state, text) in shown {
+            assert_eq!(state.to_string(), text);
+        }
+    }
+}

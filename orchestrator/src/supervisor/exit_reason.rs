@@ -168,6 +168,32 @@ mod tests {
     }
 
     #[test]
+    fn signals_have_the_names_of_the_system() {
+        let names = [
+            (libc::SIGHUP, "SIGHUP"),
+            (libc::SIGINT, "SIGINT"),
+            (libc::SIGQUIT, "SIGQUIT"),
+            (libc::SIGILL, "SIGILL"),
+            (libc::SIGTRAP, "SIGTRAP"),
+            (libc::SIGABRT, "SIGABRT"),
+            (libc::SIGBUS, "SIGBUS"),
+            (libc::SIGFPE, "SIGFPE"),
+            (libc::SIGKILL, "SIGKILL"),
+            (libc::SIGSEGV, "SIGSEGV"),
+            (libc::SIGPIPE, "SIGPIPE"),
+            (libc::SIGALRM, "SIGALRM"),
+            (libc::SIGTERM, "SIGTERM"),
+            (libc::SIGXCPU, "SIGXCPU"),
+            (libc::SIGXFSZ, "SIGXFSZ"),
+            (libc::SIGSYS, "SIGSYS"),
+        ];
+        for (signal, name) in names {
+            assert_eq!(signal_name(signal), name);
+        }
+        assert_eq!(signal_name(libc::SIGUSR1), "");
+    }
+
+    #[test]
     fn exit_reasons_are_displayed() {
         let exit = |last_line: Option<&str>| {
             ExitReason::Exit { code: 2, last_line: last_line.map(str::to_owned) }.to_string()

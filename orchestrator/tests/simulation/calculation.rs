@@ -2,9 +2,10 @@
 
 use dft::FailureClass;
 
+use super::event::Event;
 use super::fault::Time;
 use super::random::Random;
-use super::world::{Event, World};
+use super::world::World;
 
 /// A calculation.
 #[derive(Clone, Debug)]

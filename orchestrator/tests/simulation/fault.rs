@@ -118,6 +118,12 @@ pub enum Fault {
         agent: u32,
         until: Time,
     },
+    /// An agent cannot be reached until another one has joined the walks of the next version, and some time longer.
+    MissVersion {
+        agent: u32,
+        delay: Time,
+        until: Time,
+    },
     /// A walker of an agent is killed.
     KillAgentWalker {
         agent: u32,
@@ -271,11 +277,25 @@ impl Fault {
             | Self::StopAgent { until, .. }
             | Self::MuteAgent { until, .. }
             | Self::LoseAgent { until, .. }
+            | Self::MissVersion { until, .. }
             | Self::PauseWalks { until } => *until,
             Self::Slurm(fault) => fault.end(at),
             _ => at,
         }
     }
+}
+
+/// An agent that is out of reach exactly while a version is taken up, in half of the seeds that have both.
+fn missed_version(seed: u64, scenario: &Scenario) -> Option<PlannedFault> {
+    // Numbers of their own: the other faults of a seed are what they would be without it.
+    let mut random = Random::new(seed ^ 0x00fb_u64.rotate_left(40));
+    if scenario.refits.is_none() || scenario.agents == 0 || random.happens(50) {
+        return None;
+    }
+    let at = random.between(2_000, 30_000);
+    let agent = random.below(scenario.agents.into()) as u32;
+    let (delay, until) = (random.below(20_000), at + 3 * LONGEST);
+    Some(PlannedFault { at, fault: Fault::MissVersion { agent, delay, until } })
 }
 
 /// The plan of a seed, in order of time.
@@ -303,6 +323,7 @@ pub fn plan(seed: u64, scenario: &Scenario) -> Vec<PlannedFault> {
     if scenario.has_fixed_labels() {
         plan.iter_mut().for_each(|planned| planned.fault.keep_labels(&mut random));
     }
+    plan.extend(missed_version(seed, scenario));
     plan.sort_by_key(|planned| planned.at);
     // A third crash in the same assignment would end its walk, and a reproducible campaign would differ.
     let mut crashes = 0;
@@ -394,6 +415,12 @@ impl fmt::Display for Fault {
             Self::LoseAgent { agent, until } => {
                 write!(f, "agent {agent} cannot be reached until {} s", seconds(until))
             }
+            Self::MissVersion { agent, delay, until } => write!(
+                f,
+                "agent {agent} cannot be reached until another one has joined the walks of the next version, and {} s longer, or until {} s",
+                seconds(delay),
+                seconds(until)
+            ),
             Self::KillAgentWalker { agent, walker, .. } => {
                 write!(f, "walker {walker} of agent {agent} is killed")
             }

@@ -8,6 +8,7 @@ use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{ConnectOptions, SqliteConnection};
 use wire::messages::Assignment;
 
+use super::dealing::SentMixtures;
 use super::walker::WalkerKey;
 use super::world::World;
 
@@ -18,6 +19,8 @@ pub struct Known {
     pub decisions: i64,
     /// Accepted candidates of acknowledged commits.
     pub accepted: BTreeSet<String>,
+    /// Assignments that were sent.
+    pub sent: SentMixtures,
     /// Offers that arrived: the process and the number.
     pub offers: BTreeSet<(WalkerKey, u64)>,
     /// The answer to [`GROWING`].

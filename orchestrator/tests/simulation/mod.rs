@@ -9,11 +9,16 @@
 
 mod agent;
 mod calculation;
+mod dealing;
+mod disturbance;
+mod event;
 mod fault;
 mod faulty_store;
 mod invariants;
 mod labeller;
 mod ladder;
+mod link;
+mod person;
 mod planted;
 mod random;
 mod reactor_shell;
@@ -37,7 +42,7 @@ use tempfile::TempDir;
 
 use self::fault::{PlannedFault, plan};
 use self::planted::PlantedBug;
-use self::scenario::{AGENT_SEEDS, REFIT_SEEDS, SEED_STRUCTURES, SLURM_SEEDS, Scenario};
+use self::scenario::{AGENT_SEEDS, CUSTOM_SEEDS, REFIT_SEEDS, SEED_STRUCTURES, SLURM_SEEDS, Scenario};
 use self::world::{Outcome, World};
 use crate::common::{CAMPAIGN, seed_structure};
 
@@ -49,6 +54,8 @@ const SEEDS_WITH_AGENTS: u64 = 24;
 const SEEDS_WITH_REFITS: u64 = 8;
 /// The same with Slurm jobs.
 const SEEDS_WITH_SLURM: u64 = 12;
+/// The same with jobs of PBS or LSF.
+const SEEDS_WITH_CUSTOM: u64 = 8;
 /// A planted bug must be found within this number of seeds.
 const SEEDS_TO_FIND: u64 = 1_000;
 
@@ -167,6 +174,12 @@ fn no_seed_with_refits_breaks_an_invariant() {
 #[test]
 fn no_seed_with_slurm_breaks_an_invariant() {
     check_seeds(SLURM_SEEDS..SLURM_SEEDS + number_in("CALMWALK_SEEDS").unwrap_or(SEEDS_WITH_SLURM));
+}
+
+/// The same with jobs of PBS or LSF.
+#[test]
+fn no_seed_with_another_batch_system_breaks_an_invariant() {
+    check_seeds(CUSTOM_SEEDS..CUSTOM_SEEDS + number_in("CALMWALK_SEEDS").unwrap_or(SEEDS_WITH_CUSTOM));
 }
 
 fn check_seeds(seeds: std::ops::Range<u64>) {

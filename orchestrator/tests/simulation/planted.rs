@@ -1,7 +1,7 @@
 //! Mistakes that are made on purpose, to see that the simulation finds them. They are made at the edges, never in the
 //! program itself.
 
-use super::scenario::{AGENT_SEEDS, REFIT_SEEDS, SLURM_SEEDS};
+use super::scenario::{AGENT_SEEDS, CUSTOM_SEEDS, REFIT_SEEDS, SLURM_SEEDS};
 
 /// A mistake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -50,6 +50,12 @@ pub enum PlantedBug {
     AgentIdReused,
     /// An agent takes a late reply for one to its current request.
     LateReplyBelieved,
+    /// An agent deals an assignment to a second walker.
+    AssignmentDealtTwice,
+    /// Walkers of agents get the newest mixture in place of that of their assignment.
+    NewestMixture,
+    /// A run uses one session for the agents of all versions of the potential.
+    SessionOfAllVersions,
     /// An agent that has lost its registration starts again with the slots of the old one.
     OldSlotsKept,
     /// After a restart the orchestrator does not know how many versions may be trained.
@@ -76,10 +82,14 @@ pub enum PlantedBug {
     NodeFailuresCounted,
     /// Each attempt begins with the first adjustments again.
     LadderRestarted,
+    /// A labeller forgets that a number of a submission was refused, and may have a job all the same.
+    RefusalForgotten,
+    /// A labeller removes every directory that another one left, whether its result is needed or not.
+    WantedRemoved,
 }
 
 impl PlantedBug {
-    pub const ALL: [Self; 35] = [
+    pub const ALL: [Self; 40] = [
         Self::AnswerBeforeCommit,
         Self::FailedCommitBelieved,
         Self::CommitRepeated,
@@ -103,6 +113,9 @@ impl PlantedBug {
         Self::AgentIdReused,
         Self::LateReplyBelieved,
         Self::OldSlotsKept,
+        Self::AssignmentDealtTwice,
+        Self::NewestMixture,
+        Self::SessionOfAllVersions,
         Self::VersionLimitForgotten,
         Self::VersionRecordedTwice,
         Self::OldWalksContinue,
@@ -115,6 +128,8 @@ impl PlantedBug {
         Self::EndsMixedUp,
         Self::NodeFailuresCounted,
         Self::LadderRestarted,
+        Self::RefusalForgotten,
+        Self::WantedRemoved,
     ];
 }
 
@@ -122,10 +137,14 @@ impl PlantedBug {
     /// The first seed of those that can find it.
     pub fn first_seed(self) -> u64 {
         match self {
-            Self::AgentLossForgotten | Self::AgentIdReused | Self::LateReplyBelieved | Self::OldSlotsKept => {
-                AGENT_SEEDS
-            }
-            Self::VersionLimitForgotten
+            Self::AgentLossForgotten
+            | Self::AgentIdReused
+            | Self::LateReplyBelieved
+            | Self::OldSlotsKept
+            | Self::AssignmentDealtTwice
+            | Self::NewestMixture => AGENT_SEEDS,
+            Self::SessionOfAllVersions
+            | Self::VersionLimitForgotten
             | Self::VersionRecordedTwice
             | Self::OldWalksContinue
             | Self::RefitAbandoned
@@ -137,6 +156,7 @@ impl PlantedBug {
             | Self::EndsMixedUp
             | Self::NodeFailuresCounted
             | Self::LadderRestarted => SLURM_SEEDS,
+            Self::RefusalForgotten | Self::WantedRemoved => CUSTOM_SEEDS,
             _ => 0,
         }
     }
@@ -164,6 +184,11 @@ impl PlantedBug {
             Self::CalculationRecordedLate => 57,
             Self::AgentLossForgotten => AGENT_SEEDS,
             Self::LateReplyBelieved | Self::OldSlotsKept => AGENT_SEEDS + 1,
+            Self::RefusalForgotten => CUSTOM_SEEDS + 195,
+            Self::WantedRemoved => CUSTOM_SEEDS + 90,
+            Self::AssignmentDealtTwice => AGENT_SEEDS,
+            Self::NewestMixture => AGENT_SEEDS + 15,
+            Self::SessionOfAllVersions => REFIT_SEEDS + 35,
             Self::AgentIdReused | Self::RefitAbandoned | Self::RefusedVersionTakenUp => self.first_seed(),
             Self::VersionLimitForgotten | Self::VersionRecordedTwice | Self::OldWalksContinue => {
                 REFIT_SEEDS + 1

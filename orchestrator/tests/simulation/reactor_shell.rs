@@ -7,13 +7,14 @@ use store::records::Fate;
 use wire::datagram::AnswerDatagram;
 use wire::transport::WorkItem;
 
+use super::event::Event;
 use super::fault::Direction;
 use super::faulty_store::CommitTry;
 use super::planted::PlantedBug;
 use super::refit::RunRefits;
 use super::run::TICK;
 use super::walker::WalkerKey;
-use super::world::{Event, World};
+use super::world::World;
 
 /// Most messages of walkers that may wait for the reactor: an offer and an exit of each, and some progress.
 const MAX_INCOMING: usize = 64 + 2 * 8;
@@ -98,6 +99,7 @@ impl World {
         if Some(session) == self.leader() {
             self.check_assignment(&work.assignment);
         }
+        self.known.sent.add(&work);
         let run = self.runs.get_mut(&session).unwrap();
         let version = work.mixture.version();
         let before = run.shared_memory.values().next_back();

@@ -10,9 +10,10 @@ use orchestrator::supervisor::{ChildState, Limits, Supervisor, SupervisorAction}
 use serde_json::json;
 use store::{StoreError, VersionRecord, VersionState};
 
+use super::event::{Event, Exit};
 use super::fault::{ClientKind, Time};
 use super::planted::PlantedBug;
-use super::world::{Event, Exit, WALL_CLOCK, World};
+use super::world::{WALL_CLOCK, World};
 
 /// Time between two looks for refits and versions beside walks.
 const CHECK_INTERVAL: Time = 2_000;
@@ -75,6 +76,11 @@ impl RunRefits {
 }
 
 impl World {
+    /// The version of the walks of a run.
+    pub fn version_of(&self, session: u64) -> u32 {
+        self.runs.get(&session).and_then(|run| run.refits.as_ref()).map_or(0, |refits| refits.version)
+    }
+
     pub fn refit_event(&mut self, event: RefitEvent) {
         match event {
             RefitEvent::Check(session) => self.look_for_refits(session),

@@ -9,12 +9,13 @@ use monitor::refit_record::recorded_before;
 use serde_json::json;
 use store::{ExportCursor, ProcessRecord, StoreError, VersionFiles, VersionRecord, VersionState};
 
+use super::event::{Event, Exit};
 use super::fault::{ClientKind, Time};
 use super::labeller::PROTOCOL;
 use super::planted::PlantedBug;
 use super::random::Random;
 use super::refit::{RefitEvent, refused_version};
-use super::world::{Event, Exit, World};
+use super::world::World;
 
 /// Number of steps of a training.
 const EPOCHS: u32 = 4;

@@ -17,11 +17,12 @@ use wire::net::AgentBootstrap;
 use wire::net::datagram::AgentDatagramServer;
 
 use super::agent::AGENT_TIMEOUT;
+use super::event::Event;
 use super::fault::{ClientKind, Time};
 use super::planted::PlantedBug;
 use super::refit::RunRefits;
 use super::scenario::SEED_STRUCTURES;
-use super::world::{Event, World};
+use super::world::World;
 use crate::common::restore;
 
 /// Time between two heartbeats of a run.
@@ -116,7 +117,7 @@ impl World {
         let stopping = CancellationToken::new();
         let limits = Limits { detached: true, ..LIMITS };
         let agents = AgentDatagramServer::new(
-            session,
+            self.session_of_agents(session, &record),
             AGENT_TIMEOUT,
             AgentBootstrap { setup: version.to_string().into_bytes(), ..AgentBootstrap::default() },
             Arc::clone(selector.mixture()),
@@ -154,6 +155,15 @@ impl World {
         }
         self.watch_refits(session);
         self.after(HEARTBEAT_INTERVAL, Event::RunHeartbeat(session));
+    }
+
+    /// The session that distinguishes a run from others for agents. The walks of each version have one of their own.
+    fn session_of_agents(&self, session: u64, process: &ProcessRecord) -> u64 {
+        let first = process.id.trim_start_matches("run-").parse();
+        match self.bug {
+            Some(PlantedBug::SessionOfAllVersions) => first.unwrap_or(session),
+            _ => session,
+        }
     }
 
     /// Reclaims leases, registers, restores the selector, and starts walks.

@@ -18,6 +18,8 @@ pub const AGENT_SEEDS: u64 = 1 << 32;
 pub const REFIT_SEEDS: u64 = 1 << 33;
 /// Seeds from this one on label in Slurm jobs, and their jobs are of different difficulty.
 pub const SLURM_SEEDS: u64 = 1 << 34;
+/// Seeds from this one on have PBS or LSF in place of Slurm.
+pub const CUSTOM_SEEDS: u64 = 1 << 35;
 /// Number of seed structures.
 pub const SEED_STRUCTURES: usize = 3;
 
@@ -31,8 +33,10 @@ pub struct Scenario {
     /// Agents on other hosts, each with two walkers and an assignment in reserve.
     pub agents: u32,
     pub labellers: u32,
-    /// Calculations are Slurm jobs.
+    /// Calculations are jobs of a batch system, …
     pub slurm: bool,
+    /// … which is PBS or LSF.
+    pub custom: bool,
     /// Walkers wait while more label jobs are unfinished.
     pub queue_limit: u64,
     /// Number of labels that the campaign may make.
@@ -77,8 +81,10 @@ impl Scenario {
     /// The scenario of a seed.
     pub fn of(seed: u64) -> Self {
         let (has_refits, slurm) = ((REFIT_SEEDS..SLURM_SEEDS).contains(&seed), seed >= SLURM_SEEDS);
-        let first =
-            [0, AGENT_SEEDS, REFIT_SEEDS, SLURM_SEEDS].into_iter().rfind(|first| seed >= *first).unwrap();
+        let first = [0, AGENT_SEEDS, REFIT_SEEDS, SLURM_SEEDS, CUSTOM_SEEDS]
+            .into_iter()
+            .rfind(|first| seed >= *first)
+            .unwrap();
         let number = seed % SCENARIOS + first;
         // With refits, a file and a server have agents, in live and in reproducible mode.
         let has_agents = match has_refits {
@@ -102,6 +108,7 @@ impl Scenario {
             agents: if has_agents { 2 } else { 0 },
             labellers: if slurm { 2 } else { random.between(1, 2) as u32 },
             slurm,
+            custom: seed >= CUSTOM_SEEDS,
             // A used-up budget ends a run in earnest; here the queue stays.
             queue_limit: if label_budget.is_none() && random.happens(60) { 3 } else { 1000 },
             label_budget,

@@ -3,11 +3,12 @@
 use orchestrator::supervisor::{ChildState, SupervisorAction};
 use store::ProcessRecord;
 
+use super::event::{Event, Exit};
 use super::fault::{ClientKind, Time};
 use super::planted::PlantedBug;
 use super::run::Run;
 use super::walker::WalkerKey;
-use super::world::{Event, Exit, World};
+use super::world::World;
 
 /// The hash of what labellers are started with.
 const SETUP: &str = "setup";

@@ -6,10 +6,11 @@ use calm::Mixture;
 use wire::datagram::{DatagramWalker, OfferAnswer};
 use wire::messages::Assignment;
 
+use super::event::{Event, Exit};
 use super::fault::{Direction, Time};
 use super::planted::PlantedBug;
 use super::scenario::SEED_STRUCTURES;
-use super::world::{Event, Exit, World};
+use super::world::World;
 use crate::common::scripted::advance;
 use crate::common::seed_structure;
 
@@ -152,6 +153,8 @@ impl World {
         let Some(mixture) = mixture else {
             return self.fail(format!("walker {} cannot read version {version} of the mixture", key.number));
         };
+        self.check_mixture_of(&format!("walker {}", key.number), &assignment, &mixture);
+        let Some(process) = self.walkers.get(&key) else { return };
         let time = if process.sigterm { 200 } else { self.random.between(1_500, 5_000) };
         let process = self.walkers.get_mut(&key).unwrap();
         process.phase = Phase::Working { assignment, mixture };

@@ -8,21 +8,22 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use sqlx::SqliteConnection;
-use store::{Budget, ProcessRecord, RelabelRequest, Store};
+use store::{Budget, ProcessRecord, Store};
 
-use super::agent::{AgentEventKind, AgentKey, AgentProcess};
+use super::agent::{AgentProcess, MissingAgent};
 use super::calculation::Calculation;
-use super::fault::{ClientKind, Direction, FIRST_AGENT, Fault, LinkTrouble, PlannedFault, Time};
+use super::event::{Event, Queued};
+use super::fault::{PlannedFault, Time};
 use super::faulty_store::FaultyStore;
 use super::invariants::Known;
-use super::labeller::{Labeller, PROTOCOL};
+use super::labeller::Labeller;
+use super::link::Links;
 use super::planted::PlantedBug;
 use super::random::Random;
-use super::refit::RefitEvent;
 use super::refitter::RefitProcesses;
 use super::run::Run;
 use super::scenario::Scenario;
-use super::slurm::{SlurmEvent, SlurmWorld};
+use super::slurm::SlurmWorld;
 use super::walker::{WalkerKey, WalkerProcess};
 
 /// The wall clock at the start, ms since 1970.
@@ -35,79 +36,6 @@ const MAX_EVENTS: usize = 40_000;
 const MAX_QUEUED: usize = 2_000;
 /// How long a run is away after it ended.
 const RESTART_DELAY: Time = 4_000;
-
-/// What happens next.
-#[derive(Clone, Debug)]
-pub enum Event {
-    Fault(usize),
-    /// The end of a pause of all walks.
-    Resume,
-    /// A walker is killed, and again until this time.
-    KillAgain(u32, Time),
-    StartRun,
-    /// A message arrives at the server of a run.
-    ToServer {
-        from: WalkerKey,
-        sequence: u64,
-        bytes: Vec<u8>,
-    },
-    /// An answer arrives at a walker.
-    ToWalker {
-        to: WalkerKey,
-        bytes: Vec<u8>,
-    },
-    WalkerStarts(WalkerKey),
-    WalkerPolls(WalkerKey, u64),
-    WalkerFinishes(WalkerKey, u64),
-    /// A run learns that a walker's process has ended.
-    WalkerGone(WalkerKey, Exit),
-    CommitDue(u64),
-    RunTick(u64),
-    RunHeartbeat(u64),
-    RunSupervises(u64),
-    LabellerStarts(u32),
-    LabellerActs(u32, u64),
-    LabellerHeartbeat(u32),
-    /// A run learns that a labeller with this record has ended.
-    LabellerGone(u32, String, Exit),
-    CalculationEnds(String),
-    Slurm(SlurmEvent),
-    Agent(AgentKey, AgentEventKind),
-    /// A request of an agent arrives at the run that leads.
-    AgentRequest(AgentKey, u64, Vec<u8>),
-    /// The heartbeat of an agent with this id is there again.
-    AgentHeard(String),
-    /// A run looks for silent agents.
-    AgentExpiry(u64),
-    Refit(RefitEvent),
-}
-
-/// Something that happens at a time; of two at the same time, what was planned first.
-struct Queued {
-    at: Time,
-    number: u64,
-    event: Event,
-}
-
-impl PartialEq for Queued {
-    fn eq(&self, other: &Self) -> bool {
-        (self.at, self.number) == (other.at, other.number)
-    }
-}
-
-impl Eq for Queued {}
-
-impl PartialOrd for Queued {
-    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl Ord for Queued {
-    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
-        (self.at, self.number).cmp(&(other.at, other.number))
-    }
-}
 
 /// How a simulation ended.
 pub struct Outcome {
@@ -144,14 +72,14 @@ pub struct World {
     pub slurm: SlurmWorld,
     pub known: Known,
     pub violation: Option<String>,
-    /// Faults of links that last, with their end.
-    links: Vec<(u32, Direction, LinkTrouble, Time)>,
+    pub links: Links,
+    pub missing: Vec<MissingAgent>,
     pub next_session: u64,
     pub next_labeller: u32,
     /// Jobs that a person dropped or requeued.
     pub handled: BTreeSet<i64>,
     pub over: bool,
-    clock_offset: i64,
+    pub clock_offset: i64,
     base: Instant,
     queue: BinaryHeap<Reverse<Queued>>,
     planned: u64,
@@ -174,6 +102,7 @@ impl World {
             runtime.block_on(store.set_configuration_in_force(&configuration, &[], 0)).unwrap();
         }
         let direct = runtime.block_on(super::invariants::connect(directory));
+        let slurm = SlurmWorld::new(seed, &scenario);
         let mut world = Self {
             now: 0,
             random: Random::new(seed),
@@ -188,10 +117,11 @@ impl World {
             labellers: BTreeMap::new(),
             calculations: BTreeMap::new(),
             refits: RefitProcesses::default(),
-            slurm: SlurmWorld::new(seed),
+            slurm,
             known: Known::default(),
             violation: None,
-            links: Vec::new(),
+            links: Links::default(),
+            missing: Vec::new(),
             next_session: 1,
             next_labeller: 1,
             handled: BTreeSet::new(),
@@ -217,6 +147,8 @@ impl World {
     /// Runs until the campaign is over, or an invariant is broken.
     pub fn run(mut self) -> Outcome {
         let faults_end = self.plan.iter().map(|planned| planned.fault.end(planned.at)).max().unwrap_or(0);
+        // A job whose id was lost counts as running for ten minutes.
+        let time_to_end = if self.scenario.custom { 6 * TIME_TO_END } else { TIME_TO_END };
         let mut events = 0;
         while !self.over && self.violation.is_none() {
             let Some(Reverse(Queued { at, number, event })) = self.queue.pop() else {
@@ -232,7 +164,7 @@ impl World {
                 self.check_store();
             }
             self.check_memory();
-            if at > faults_end + TIME_TO_END || events > MAX_EVENTS {
+            if at > faults_end + time_to_end || events > MAX_EVENTS {
                 self.fail("the faults are over, and the campaign does not end".to_owned());
             }
         }
@@ -298,32 +230,6 @@ impl World {
         }
     }
 
-    /// Sends a message, if the link lets it pass.
-    pub fn send(&mut self, direction: Direction, walker: u32, event: Event) {
-        let mut delay = self.random.between(1, 20);
-        let mut copies = 1;
-        let now = self.now;
-        self.links.retain(|(.., until)| *until > now);
-        let troubles: Vec<LinkTrouble> = self
-            .links
-            .iter()
-            .filter(|(of, way, ..)| (*of, *way) == (walker, direction))
-            .map(|(_, _, trouble, _)| *trouble)
-            .collect();
-        for trouble in troubles {
-            match trouble {
-                LinkTrouble::Cut => copies = 0,
-                LinkTrouble::Loss => copies *= u64::from(self.random.happens(40)),
-                LinkTrouble::Delay => delay += self.random.below(8_000),
-                LinkTrouble::Repetition => copies *= self.random.between(1, 3),
-            }
-        }
-        for _ in 0..copies {
-            self.after(delay, event.clone());
-            delay += self.random.below(3_000);
-        }
-    }
-
     fn handle(&mut self, event: Event) {
         match event {
             Event::Fault(number) => self.begin_fault(self.plan[number].fault.clone()),
@@ -350,6 +256,7 @@ impl World {
             Event::AgentRequest(key, request, bytes) => self.agent_request_arrives(key, request, bytes),
             Event::AgentHeard(id) => self.agent_heard(&id),
             Event::AgentExpiry(session) => self.agents_expire(session),
+            Event::AgentReturns(agent) => self.agent_returns(agent),
             Event::Refit(event) => self.refit_event(event),
         }
     }
@@ -357,104 +264,6 @@ impl World {
     /// The run that leads the campaign, if it is alive.
     pub fn leader(&self) -> Option<u64> {
         self.runs.keys().next_back().copied().filter(|session| !self.store.is_replaced(*session))
-    }
-
-    fn begin_fault(&mut self, fault: Fault) {
-        self.tell(fault.to_string());
-        match fault {
-            Fault::Link { walker, direction, trouble, until } => {
-                self.links.push((walker, direction, trouble, until));
-            }
-            Fault::NextWrite { client, moment } => self.store.next_writes.push((client, moment)),
-            Fault::StoreAway { until } => self.store.away_until = self.store.away_until.max(until),
-            Fault::StoreFull { until } => self.store.full_until = self.store.full_until.max(until),
-            Fault::KillWalker { walker, crash } => {
-                if let Some(key) = self.leader().and_then(|run| self.newest_walker(run, walker)) {
-                    self.walker_exits(key, if crash { Exit::Crash } else { Exit::Killed });
-                }
-            }
-            Fault::StopWalker { walker, until } => {
-                let key = self.leader().and_then(|run| self.newest_walker(run, walker));
-                if let Some(process) = key.and_then(|key| self.walkers.get_mut(&key)) {
-                    process.stopped_until = until;
-                }
-            }
-            Fault::KillWalkerOften { walker, until } => {
-                self.links.push((walker, Direction::ToOrchestrator, LinkTrouble::Delay, until));
-                self.kill_walker_again(walker, until);
-            }
-            Fault::KillLabeller { labeller, crash } => {
-                if let Some(id) = self.newest_labeller(labeller) {
-                    self.labeller_exits(id, if crash { Exit::Crash } else { Exit::Killed });
-                }
-            }
-            Fault::StopLabeller { labeller, until } => {
-                if let Some(id) = self.newest_labeller(labeller) {
-                    self.labellers.get_mut(&id).unwrap().stopped_until = until;
-                }
-            }
-            Fault::StartLabellerTwice { labeller } => {
-                if self.newest_labeller(labeller).is_some() {
-                    self.new_labeller(labeller);
-                }
-            }
-            Fault::KillOrchestrator => {
-                if let Some(session) = self.leader() {
-                    self.run_ends(session, "it was killed");
-                }
-            }
-            Fault::StopInOrder => {
-                if let Some(session) = self.leader() {
-                    self.stop_run(session);
-                }
-            }
-            Fault::StartOrchestratorTwice => self.start_run(),
-            Fault::Hang { until } => self.hang(until),
-            Fault::ClockJump { milliseconds } => self.clock_offset += milliseconds,
-            Fault::DropJob => self.drop_job(),
-            Fault::RetryJob => self.retry_job(),
-            Fault::Relabel => self.relabel(),
-            Fault::PauseWalks { until } => {
-                self.pause_walks(true);
-                self.at(until, Event::Resume);
-            }
-            Fault::KillCalculation => self.kill_calculation(),
-            Fault::Slurm(fault) => self.begin_slurm_fault(fault),
-            Fault::KillAgent { agent } => self.kill_agent(agent),
-            Fault::StopAgent { agent, until } => self.stop_agent(agent, until),
-            Fault::MuteAgent { agent, until } => self.mute_agent(agent, until),
-            Fault::LoseAgent { agent, until } => {
-                for direction in [Direction::ToOrchestrator, Direction::ToWalker] {
-                    self.links.push((FIRST_AGENT + agent, direction, LinkTrouble::Cut, until));
-                }
-                self.mute_agent(agent, until);
-            }
-            Fault::KillAgentWalker { agent, walker, crash } => self.kill_agent_walker(agent, walker, crash),
-            Fault::KillRefitter { after, times, crash } => {
-                self.kill_refitter(after, times, if crash { Exit::Crash } else { Exit::Killed });
-            }
-            Fault::RollBack => self.roll_back(),
-        }
-    }
-
-    fn kill_walker_again(&mut self, walker: u32, until: Time) {
-        if let Some(key) = self.leader().and_then(|run| self.newest_walker(run, walker)) {
-            self.walker_exits(key, Exit::Killed);
-        }
-        let delay = self.random.between(1_500, 3_500);
-        if self.now + delay < until {
-            self.after(delay, Event::KillAgain(walker, until));
-        }
-    }
-
-    /// The orchestrator hangs. On a server its lock is lost meanwhile, and another orchestrator takes over.
-    fn hang(&mut self, until: Time) {
-        let Some(run) = self.leader().and_then(|session| self.runs.get_mut(&session)) else { return };
-        run.stopped_until = until;
-        if self.scenario.server {
-            run.lock = None;
-            self.start_run();
-        }
     }
 
     /// A run has ended, in whatever way. Somebody starts it again, unless the campaign is over.
@@ -474,94 +283,9 @@ impl World {
         self.store.runtime.block_on(mark.execute(&mut self.direct)).unwrap();
     }
 
-    fn drop_job(&mut self) {
-        let jobs = self.store.runtime.block_on(self.store.store.queue_list(None, 100, 0)).unwrap();
-        let open: Vec<_> =
-            jobs.iter().filter(|job| ["queued", "leased"].contains(&job.state.name())).collect();
-        if open.is_empty() {
-            return;
-        }
-        let job = open[self.random.below(open.len() as u64) as usize];
-        self.handled.insert(job.job);
-        let (name, now) = (job.candidate.clone(), self.wall_clock());
-        let dropped = self.store.write(self.now, ClientKind::Labeller, "a job is dropped", async |store| {
-            store.drop_job(&name, now).await
-        });
-        self.tell(format!("job {} is dropped: {}", job.job, dropped.is_ok()));
-    }
-
-    fn retry_job(&mut self) {
-        let jobs = self.store.runtime.block_on(self.store.store.queue_list(None, 100, 0)).unwrap();
-        let open = jobs.iter().find(|job| ["failed", "dropped"].contains(&job.state.name()));
-        let Some(job) = open else { return };
-        self.handled.insert(job.job);
-        let (name, now) = (job.candidate.clone(), self.wall_clock());
-        let retried = self.store.write(self.now, ClientKind::Labeller, "a job is requeued", async |store| {
-            store.retry_job(&name, now).await
-        });
-        self.tell(format!("job {} is requeued: {}", job.job, retried.is_ok()));
-    }
-
-    fn relabel(&mut self) {
-        let now = self.wall_clock();
-        self.slurm.ladders.forget();
-        let relabelled =
-            self.store.write(self.now, ClientKind::Labeller, "new labels are requested", async |store| {
-                let labelled = store.relabellable(PROTOCOL).await?;
-                let structures: Vec<_> = labelled.iter().map(|found| found.content).collect();
-                let request = RelabelRequest {
-                    structures: &structures,
-                    include_current: true,
-                    reason: "doubtful",
-                    protocol: None,
-                };
-                store.relabel(&request, now).await?;
-                Ok(structures.len())
-            });
-        self.tell(format!("new labels are requested: {relabelled:?}"));
-    }
-
-    /// A person tries again until it is done.
-    fn pause_walks(&mut self, pause: bool) {
-        let now = self.wall_clock();
-        let result = self.store.write(self.now, ClientKind::Labeller, "walks are paused", async |store| {
-            let walks = match pause {
-                true => store.active_walks().await?,
-                false => store.paused_walks().await?.into_iter().collect(),
-            };
-            if walks.is_empty() { Ok(walks) } else { store.pause_walks(&walks, pause, now).await }
-        });
-        if result.is_err() && !pause {
-            self.after(1_000, Event::Resume);
-        }
-    }
-
     /// The record of a living process.
     pub fn process_record(&self, kind: &str, number: Option<u32>, id: String) -> ProcessRecord {
         let record = ProcessRecord::new(kind, number, std::process::id(), self.wall_clock());
         ProcessRecord { id, host: "box".into(), ..record }
-    }
-}
-
-/// How a process ends.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Exit {
-    /// It finished.
-    Done,
-    /// It gave up.
-    Failed,
-    Killed,
-    Crash,
-}
-
-impl Exit {
-    pub fn reason(self) -> orchestrator::supervisor::ExitReason {
-        use orchestrator::supervisor::ExitReason;
-        match self {
-            Self::Done => ExitReason::Exit { code: 0, last_line: None },
-            Self::Failed => ExitReason::Exit { code: 1, last_line: None },
-            Self::Killed => ExitReason::Signal { signal: 9, last_line: None },
-            Self::Crash => ExitReason::Signal { signal: 11, last_line: None },
-        }
     }
 }

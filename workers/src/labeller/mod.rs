@@ -74,8 +74,13 @@ pub use validate::LabelBounds;
 pub mod decisions {
     pub use super::calculation_runner::{CalculationEnd, EndReason};
     pub use super::calculation_state::{CalculationState, EarlierStep, WaitStep};
+    pub use super::custom_jobs::{
+        AfterFailure, CustomDirectory, CustomInspection, CustomStep, CustomSubmission, JobSubmission,
+        MAX_SUBMISSIONS, SubmissionFailure, infer_custom_end,
+    };
     pub use super::failure_classes::failure_classes;
     pub use super::retry_decision::{attempt_limit, counts_as_attempt, failure_at, next_adjustments};
+    pub use super::scratch::is_left_over;
     pub use super::slurm::{
         Inspection, InspectionStep, JobDirectory, SqueueJob, SubmissionRetry, SubmissionStep, Traces,
         infer_end, is_listed, jobs_to_cancel,

@@ -10,7 +10,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use store::{Store, StoreError};
+use store::{PastCalculation, Store, StoreError};
 use tokio_util::sync::CancellationToken;
 use wire::CampaignId;
 
@@ -145,22 +145,28 @@ async fn cleanup_one(
 ) -> Result<(), StoreError> {
     let Some((job, attempt)) = job_and_attempt(directory) else { return Ok(()) };
     let past = retry_until_written(stop, || store.past_calculation(job, attempt)).await?;
-    // It belongs to a copy of this campaign.
+    // Otherwise it belongs to a copy of this campaign.
     let Some(past) = past.filter(|past| !past.wanted) else { return Ok(()) };
     let handle = past.calculation.as_deref().and_then(CalculationHandle::parse);
-    let is_over = match handle.filter(|handle| handle.directory() == directory) {
-        Some(handle) => !matches!(handle.inspect(batch).await?, CalculationState::Running),
-        // Its creator was killed before anything started.
-        None => true,
+    let state = match handle.filter(|handle| handle.directory() == directory) {
+        Some(handle) => Some(handle.inspect(batch).await?),
+        None => None,
     };
-    if is_over && keep.keeps(past.failed) {
+    let is_removed = is_left_over(&past, state.as_ref());
+    if is_removed && keep.keeps(past.failed) {
         pack(store, job, attempt, stop, directory).await?;
     }
-    if is_over {
+    if is_removed {
         let cleared = directory.to_owned();
         blocking(move || local::clear(&cleared)).await.map_err(|error| file_error(directory, error))?;
     }
     Ok(())
+}
+
+/// Whether the directory of a calculation may be removed that no labeller waits for. `state` is `None` if its creator was killed
+/// before anything started.
+pub fn is_left_over(past: &PastCalculation, state: Option<&CalculationState>) -> bool {
+    !past.wanted && state != Some(&CalculationState::Running)
 }
 
 /// Job and attempt in the name of a directory.

@@ -11,6 +11,7 @@ use rustix::process::{Pid, Signal, kill_process_group};
 use tokio::io::{AsyncBufReadExt, AsyncRead, BufReader};
 use tokio::process::{Child, Command};
 
+use super::answer::{CommandOutput, PolledState};
 use super::error::CustomError;
 use super::request::JobRequest;
 use super::settings::CustomScheduler;
@@ -31,47 +32,10 @@ pub struct CustomClient {
     environment: Option<Vec<(OsString, OsString)>>,
 }
 
-/// The state of a job.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum PolledState {
-    /// It waits.
-    Pending,
-    /// It has a node, or its state has an unknown word.
-    Running,
-    /// It has ended, well or in any way.
-    Completed,
-    /// It has ended with an error.
-    Failed,
-    /// It was cancelled.
-    Cancelled,
-    /// The batch system does not know it (any more).
-    Vanished,
-}
-
 /// How a command ended, and what it printed.
 struct CommandAnswer {
     status: ExitStatus,
-    stdout: String,
-    stderr: String,
-}
-
-impl PolledState {
-    /// The state in the notation of `squeue`, for views of jobs of any batch system.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Pending => "PENDING",
-            Self::Running => "RUNNING",
-            Self::Completed => "COMPLETED",
-            Self::Failed => "FAILED",
-            Self::Cancelled => "CANCELLED",
-            Self::Vanished => "UNKNOWN",
-        }
-    }
-
-    /// Whether the job waits or runs.
-    pub fn is_alive(self) -> bool {
-        matches!(self, Self::Pending | Self::Running)
-    }
+    output: CommandOutput,
 }
 
 impl CustomClient {
@@ -152,20 +116,17 @@ impl CustomClient {
         let opened = File::open(script);
         let input = opened.map_err(|source| CustomError::Script { path: script.to_owned(), source })?;
         let answer = self.answer(SUBMIT, command, input.into()).await?;
-        let said = [&answer.stderr, &answer.stdout].into_iter().flat_map(|text| text.lines());
-        let is_full = |line: &&str| self.scheduler.queue_full.iter().any(|text| line.contains(text));
-        if let Some(reason) = said.into_iter().find(is_full) {
-            let (name, reason) = (self.scheduler.name.clone(), reason.trim().to_owned());
+        if let Some(reason) = self.scheduler.full_queue(&answer.output) {
+            let (name, reason) = (self.scheduler.name.clone(), reason.to_owned());
             return Err(CustomError::Full { name, reason });
         }
         answer.check(SUBMIT, command)?;
-        let after = &self.scheduler.id_after;
-        let rest = answer.stdout.split_once(after.as_str()).map(|(_, rest)| rest);
-        rest.and_then(JobId::at_start_of).ok_or_else(|| CustomError::UnexpectedOutput {
+        let id = self.scheduler.submitted_id(&answer.output);
+        id.ok_or_else(|| CustomError::UnexpectedOutput {
             key: SUBMIT,
             command: command.to_owned(),
-            found: answer.stdout.trim().to_owned(),
-            expected: match after.as_str() {
+            found: answer.output.stdout.trim().to_owned(),
+            expected: match self.scheduler.id_after.as_str() {
                 "" => "the id of the job".to_owned(),
                 after => format!("the id of the job after {after:?} (launch.custom.id_after)"),
             },
@@ -174,26 +135,18 @@ impl CustomClient {
 
     /// The state of a job.
     pub async fn poll(&self, id: &JobId) -> Result<PolledState, CustomError> {
-        let CustomScheduler { poll, state_after, vanished, .. } = &self.scheduler;
+        let CustomScheduler { poll, state_after, .. } = &self.scheduler;
         let command = self.scheduler.with_id(poll, id.as_str());
         let command = command.map_err(|fault| template_error(POLL, poll, &fault))?;
         let answer = self.answer(POLL, &command, Stdio::null()).await?;
-        let rest = answer.stdout.split_once(state_after.as_str()).map(|(_, rest)| rest);
-        let word = rest.and_then(|rest| rest.split_whitespace().next());
-        if answer.status.success()
-            && let Some(state) = word.and_then(|word| self.known_state(word))
-        {
+        if let Some(state) = self.scheduler.polled_state(&answer.output) {
             return Ok(state);
         }
-        if answer.says_any(vanished) {
-            return Ok(PolledState::Vanished);
-        }
         answer.check(POLL, &command)?;
-        // An unknown state is that of a living job.
-        word.map(|_| PolledState::Running).ok_or_else(|| CustomError::UnexpectedOutput {
+        Err(CustomError::UnexpectedOutput {
             key: POLL,
-            command: command.clone(),
-            found: answer.stdout.trim().to_owned(),
+            found: answer.output.stdout.trim().to_owned(),
+            command,
             expected: match state_after.as_str() {
                 "" => "the state of the job".to_owned(),
                 after => format!("the state of the job after {after:?} (launch.custom.state_after)"),
@@ -201,24 +154,11 @@ impl CustomClient {
         })
     }
 
-    fn known_state(&self, word: &str) -> Option<PolledState> {
-        let states = &self.scheduler.states;
-        let lists = [
-            (&states.pending, PolledState::Pending),
-            (&states.running, PolledState::Running),
-            (&states.completed, PolledState::Completed),
-            (&states.failed, PolledState::Failed),
-            (&states.cancelled, PolledState::Cancelled),
-        ];
-        let found = lists.iter().find(|(words, _)| words.iter().any(|known| known == word));
-        found.map(|(_, state)| *state)
-    }
-
     /// Cancels a job. Ignores one that has ended.
     pub async fn cancel(&self, id: &JobId) -> Result<(), CustomError> {
         let command = self.cancel_command(id)?;
         let answer = self.answer(CANCEL, &command, Stdio::null()).await?;
-        if answer.status.success() || answer.says_any(&self.scheduler.vanished) {
+        if answer.output.success || answer.output.says_any(&self.scheduler.vanished) {
             return Ok(());
         }
         match self.poll(id).await {
@@ -257,7 +197,9 @@ impl CustomClient {
         let group = child.id();
         let (out, err) = (child.stdout.take(), child.stderr.take());
         let (stdout, stderr) = tokio::join!(self.lines(out, group), self.lines(err, group));
-        Ok(CommandAnswer { status: child.wait().await?, stdout: stdout?, stderr: stderr? })
+        let status = child.wait().await?;
+        let output = CommandOutput { success: status.success(), stdout: stdout?, stderr: stderr? };
+        Ok(CommandAnswer { status, output })
     }
 
     /// What is written into a pipe. Kills a command that waits for a place in the queue: its id would come after minutes, and a
@@ -278,16 +220,13 @@ impl CustomClient {
 }
 
 impl CommandAnswer {
-    fn says_any(&self, texts: &[String]) -> bool {
-        texts.iter().any(|text| self.stdout.contains(text) || self.stderr.contains(text))
-    }
-
     /// Whether the command has ended well.
     fn check(&self, key: &'static str, command: &str) -> Result<(), CustomError> {
-        if self.status.success() {
+        let CommandOutput { success, stdout, stderr } = &self.output;
+        if *success {
             return Ok(());
         }
-        let said = [self.stderr.trim(), self.stdout.trim()].into_iter().find(|text| !text.is_empty());
+        let said = [stderr.trim(), stdout.trim()].into_iter().find(|text| !text.is_empty());
         let output = said.unwrap_or("it printed nothing").to_owned();
         Err(CustomError::Failed { key, command: command.to_owned(), status: self.status, output })
     }

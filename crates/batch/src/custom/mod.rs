@@ -1,5 +1,6 @@
 //! A batch system that a configuration describes by its commands.
 
+mod answer;
 mod client;
 mod error;
 mod request;
@@ -8,7 +9,8 @@ mod template;
 #[cfg(test)]
 mod tests;
 
-pub use client::{CustomClient, PolledState};
+pub use answer::{CommandOutput, PolledState};
+pub use client::CustomClient;
 pub use error::CustomError;
 pub use request::JobRequest;
 pub use settings::{CustomScheduler, LogTexts, StateWords};

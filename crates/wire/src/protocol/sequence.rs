@@ -155,6 +155,8 @@ mod tests {
     fn repeated_offers_are_decided_once_and_answered_each_time() {
         let mut all = expecting();
         assert_eq!(all.poll(SENDER, 1), Ok(OfferStatus::Unknown), "an offer that was lost");
+        assert_eq!(all.pending(3), None, "no offer so far");
+        assert_eq!((all.incarnation(3), all.incarnation(4)), (Some(1), None));
         for sequence in 1..4 {
             assert_eq!(all.offer(SENDER, sequence), Ok(OfferStatus::New));
             // Damaged content changes nothing.

@@ -238,3 +238,202 @@ impl<T: ServerTransport> ServerSession<T> {
         self.mixtures.values()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::task::Waker;
+
+    use atoms::{Cell, Structure};
+
+    use super::super::datagram::{DatagramServer, DatagramWalker, OfferAnswer};
+    use super::super::frame;
+    use super::*;
+    use crate::block::Candidate;
+    use crate::control::encode;
+    use crate::ids::{CampaignId, CandidateId, ContentHash, Origin};
+    use crate::messages::Outcome;
+
+    const SENDER: SenderId = SenderId { session: 7, walker: 3, incarnation: 1 };
+
+    /// A server that expects the first process of walker 3, and that process.
+    fn both_ends() -> (DatagramServer, DatagramWalker) {
+        let mut server = DatagramServer::new(SENDER.session);
+        server.expect(SENDER.walker, SENDER.incarnation);
+        let walker = DatagramWalker::new(SENDER.session, SENDER.walker, SENDER.incarnation);
+        (server, walker)
+    }
+
+    fn message(payload: Payload<'_>) -> Vec<u8> {
+        frame::with_block(&encode(&Envelope { sender: SENDER, payload }), None)
+    }
+
+    /// The answers that a walker has got.
+    fn answers(server: &mut DatagramServer, walker: &DatagramWalker) -> Vec<OfferAnswer> {
+        server.answer_decided(|_| {});
+        let answers = server.take_answers();
+        answers.iter().filter_map(|answer| walker.receive(&answer.bytes).unwrap()).collect()
+    }
+
+    #[test]
+    fn an_offer_is_forwarded_once_and_answered_when_it_is_decided() {
+        let (mut server, mut walker) = both_ends();
+        walker.begin_offer(None);
+        server.receive(&walker.poll()).unwrap();
+        assert!(matches!(answers(&mut server, &walker)[..], [OfferAnswer::Unknown]), "it was lost");
+        for _ in 0..2 {
+            server.receive(&walker.offer()).unwrap();
+        }
+        let mut incoming = server.take_incoming();
+        let Some(Incoming::Idle { walker: 3, report: None, reply }) = incoming.pop() else { panic!() };
+        assert!(incoming.is_empty() && answers(&mut server, &walker).is_empty());
+        server.receive(&walker.poll()).unwrap();
+        assert!(matches!(answers(&mut server, &walker)[..], [OfferAnswer::Pending]));
+        reply.send(None).unwrap();
+        assert!(matches!(answers(&mut server, &walker)[..], [OfferAnswer::Shutdown]));
+        for question in [walker.poll(), walker.offer()] {
+            server.receive(&question).unwrap();
+            assert!(matches!(answers(&mut server, &walker)[..], [OfferAnswer::Shutdown]), "it is repeated");
+        }
+        assert!(server.take_incoming().is_empty());
+    }
+
+    #[test]
+    fn only_the_end_of_the_current_process_is_a_loss() {
+        let (mut server, mut walker) = both_ends();
+        walker.begin_offer(None);
+        server.receive(&walker.offer()).unwrap();
+        let Some(Incoming::Idle { reply, .. }) = server.take_incoming().pop() else { panic!() };
+        server.process_ended(SENDER.walker, SENDER.incarnation + 1, true);
+        assert!(server.take_incoming().is_empty());
+        server.process_ended(SENDER.walker, SENDER.incarnation, true);
+        assert!(matches!(server.take_incoming()[..], [Incoming::Lost { walker: 3, crashed: true }]));
+        // The reactor learns that its decision reaches nobody.
+        assert!(reply.send(None).is_err());
+        assert!(server.receive(&walker.poll()).is_err());
+        server.expect(SENDER.walker, SENDER.incarnation + 1);
+        assert!(server.receive(&walker.offer()).is_err(), "a message of the process before");
+        // A successor that comes first makes it a loss as well.
+        server.expect(SENDER.walker, SENDER.incarnation + 2);
+        assert!(matches!(server.take_incoming()[..], [Incoming::Lost { walker: 3, crashed: false }]));
+    }
+
+    #[test]
+    fn a_candidate_without_a_report_is_rejected() {
+        let (mut server, _) = both_ends();
+        let offer =
+            encode(&Envelope { sender: SENDER, payload: Payload::Offer { sequence: 1, report: None } });
+        assert!(server.receive(&frame::with_block(&offer, Some(&[7; 8]))).is_err());
+        assert!(server.take_incoming().is_empty());
+    }
+
+    #[test]
+    fn progress_that_nobody_takes_is_dropped() {
+        let (mut server, mut walker) = both_ends();
+        let progress = |step| {
+            message(Payload::Progress(WalkId(5), Cow::Owned(WalkProgress { step, ..Default::default() })))
+        };
+        for step in 0..MAX_QUEUED_PROGRESS as u64 + 9 {
+            server.receive(&progress(step)).unwrap();
+        }
+        walker.begin_offer(None);
+        server.receive(&walker.offer()).unwrap();
+        let mut incoming = server.take_incoming();
+        assert!(matches!(incoming.pop(), Some(Incoming::Idle { .. })), "an offer is not dropped");
+        assert_eq!(incoming.len(), MAX_QUEUED_PROGRESS);
+        for (step, one) in (0..).zip(&incoming) {
+            assert!(matches!(one, Incoming::Progress(WalkId(5), of) if of.step == step));
+        }
+    }
+
+    /// A candidate of one atom.
+    fn candidate() -> Candidate {
+        let structure = Structure {
+            species: vec!["Al".parse().unwrap()],
+            positions: vec![[0.5, 0.0, 0.0]],
+            cell: Cell::orthorhombic(4.0, 4.0, 4.0),
+            periodic: [true; 3],
+        };
+        let content = ContentHash::from_structure(&structure);
+        Candidate {
+            id: CandidateId { campaign: CampaignId([1; 16]), walk: WalkId(5), segment: 0, step: 8, content },
+            origin: Origin::Biased,
+            mixture_version: 2,
+            temperature: 300.0,
+            relative_volume: 1.0,
+            energy: -1.5,
+            virial: [[0.0; 3]; 3],
+            structure,
+            forces: vec![[0.25, 0.0, 0.0]],
+            gamma: vec![1.5],
+            gamma_nbr: vec![1.25],
+            features: vec![0.5, 0.75],
+        }
+    }
+
+    #[test]
+    fn a_candidate_arrives_with_its_report() {
+        let (mut server, mut walker) = both_ends();
+        let report = AssignmentReport {
+            walk: WalkId(5),
+            assignment: 4,
+            start: None,
+            outcome: Outcome::Candidate(candidate()),
+            checkpoint: vec![7],
+            progress: WalkProgress::default(),
+            trace: Vec::new(),
+            frames: Vec::new(),
+        };
+        walker.begin_offer(Some(report));
+        assert_eq!(server.receive(&walker.offer()).unwrap(), (SENDER.walker, true));
+        let Some(Incoming::Idle { report: Some(report), .. }) = server.take_incoming().pop() else {
+            panic!()
+        };
+        let Outcome::Candidate(block) = report.outcome else { panic!() };
+        assert_eq!((report.assignment, block.view().to_candidate()), (4, candidate()));
+    }
+
+    /// A transport that keeps what is sent: the number of the request, and the answer.
+    #[derive(Default)]
+    struct Kept(Vec<(u32, Vec<u8>)>);
+
+    impl ServerTransport for Kept {
+        type Request = u32;
+
+        const HOLDS_POLLS: bool = true;
+
+        fn encode(answer: Answer<'_>) -> Vec<u8> {
+            encode(&answer)
+        }
+
+        fn send(&mut self, _: SenderId, request: &u32, answer: &[u8]) {
+            self.0.push((*request, answer.to_vec()));
+        }
+
+        fn candidate(&mut self, _: SenderId, _: &u32, block: &[u8]) -> Result<CandidateBlock, BlockError> {
+            CandidateBlock::from_bytes(block)
+        }
+    }
+
+    /// With a transport that holds polls, the latest request about an offer gets the answer, once.
+    #[test]
+    fn a_loss_is_forwarded_before_the_next_offer() {
+        let mut session = ServerSession::new(SENDER.session, Kept::default());
+        session.expect(SENDER.walker, SENDER.incarnation);
+        for request in [1, 2] {
+            session.receive_loss(SENDER, 1, true, &request).unwrap();
+        }
+        let poll = Envelope { sender: SENDER, payload: Payload::Poll { sequence: 1 } };
+        session.receive(poll, &3, &[]).unwrap();
+        let mut incoming: Vec<_> = session.outbox.drain(..).collect();
+        let Some(Incoming::Idle { walker: 3, report: None, reply }) = incoming.pop() else { panic!() };
+        assert!(matches!(incoming[..], [Incoming::Lost { walker: 3, crashed: true }]), "once");
+        assert!(session.transport.0.is_empty());
+        reply.send(None).unwrap();
+        let mut context = Context::from_waker(Waker::noop());
+        let Poll::Ready(decision) = session.poll_decision(&mut context) else { panic!() };
+        session.answer(decision);
+        assert!(session.poll_decision(&mut context).is_pending());
+        assert_eq!(session.transport.0.iter().map(|(request, _)| *request).collect::<Vec<_>>(), [3]);
+        assert!(session.receive_loss(SENDER, 3, true, &4).is_err(), "out of order");
+    }
+}

@@ -85,12 +85,12 @@ impl fmt::Display for SlurmFault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let seconds = |time: &Time| *time as f64 / 1000.0;
         match self {
-            Self::Away { until } => write!(f, "Slurm does not answer until {} s", seconds(until)),
-            Self::Full { until } => write!(f, "Slurm accepts no job until {} s", seconds(until)),
-            Self::ReplyLost => f.write_str("the reply to the next sbatch will be lost"),
+            Self::Away { until } => write!(f, "the batch system does not answer until {} s", seconds(until)),
+            Self::Full { until } => write!(f, "the batch system accepts no job until {} s", seconds(until)),
+            Self::ReplyLost => f.write_str("the reply to the next submission will be lost"),
             Self::LateSubmission { delay } => write!(
                 f,
-                "a labeller will be killed during its next sbatch, which submits the job {} s later",
+                "a labeller will be killed during its next submission, which arrives {} s later",
                 seconds(delay)
             ),
             Self::JobEnds { how } => write!(f, "a job ends as {}", ENDS[*how].0),

@@ -2,11 +2,16 @@
 //! a little later.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
 
+use batch::JobId;
 use dft::{FailureClass, RetryAdjustment};
-use workers::labeller::decisions::{CalculationEnd, JobDirectory, Traces};
+use workers::labeller::decisions::{
+    CalculationEnd, CustomDirectory, JobDirectory, JobSubmission, MAX_SUBMISSIONS, Traces,
+};
 
 use super::super::fault::Time;
+use super::super::planted::PlantedBug;
 
 /// Files from other hosts are visible after this time, unless the file system is in trouble.
 pub const SETTLE_TIME: Time = 2_000;
@@ -15,12 +20,19 @@ pub const SETTLE_TIME: Time = 2_000;
 #[derive(Default)]
 pub struct CalculationFiles {
     pub job: i64,
+    pub made: Time,
     pub adjustments: BTreeSet<RetryAdjustment>,
     /// Nodes that its script excludes.
     pub excluded: BTreeSet<String>,
     pub is_removed: bool,
     /// When a job has begun, and when labellers see it.
     pub begun: Option<(Time, Time)>,
+    /// The number of the submission that calculates, of another batch system than Slurm.
+    pub begun_by: u32,
+    /// Submissions to it, with the ids of their jobs, as far as they are known, and the time.
+    pub submissions: BTreeMap<u32, (Option<JobId>, Time)>,
+    /// Numbers of submissions that were refused.
+    pub refused: BTreeSet<u32>,
     /// The recorded end, when it was recorded, and when labellers see it.
     pub end: Option<(CalculationEnd, Time, Time)>,
     /// Slurm's log, with the time of its last entry.
@@ -33,6 +45,25 @@ pub struct CalculationFiles {
     pub is_damaged: bool,
     /// A job calculates now.
     pub is_running: bool,
+    /// The store has its result.
+    pub is_delivered: bool,
+    /// Its job is over, when a labeller cleaned up.
+    pub is_unwanted: bool,
+}
+
+/// Why a directory is removed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DirectoryRemoval {
+    /// The store has the result.
+    Delivered,
+    /// Nobody needs the result.
+    NotNeeded,
+    /// Nothing can be waited for there, or a newer calculation is.
+    Lost { has_newer: bool },
+    /// A killed labeller left it.
+    LeftOver,
+    /// It was calculated by another program.
+    OtherProgram,
 }
 
 /// The file system.
@@ -54,6 +85,65 @@ impl SharedFiles {
                 end: found.end.as_ref().filter(|(.., seen)| *seen <= self.now).map(|(end, ..)| end.clone()),
             },
         }
+    }
+
+    /// What a labeller sees of a job of another batch system than Slurm.
+    pub fn look_custom(&self, name: &str, bug: Option<PlantedBug>) -> CustomDirectory {
+        let found = match self.directories.get(name).filter(|found| !found.is_removed) {
+            None => return CustomDirectory::Missing,
+            Some(found) => found,
+        };
+        if let Some(end) = self.seen_end(name) {
+            return CustomDirectory::Ended(end);
+        }
+        let age = |time: Time| Duration::from_millis(self.now.saturating_sub(time));
+        let begun = found.begun.filter(|(_, seen)| *seen <= self.now);
+        let forgets = bug == Some(PlantedBug::RefusalForgotten);
+        let submissions = found.submissions.iter().map(|(number, (id, time))| JobSubmission {
+            number: *number,
+            id: id.clone(),
+            age: age(*time),
+            was_refused: found.refused.contains(number) && !forgets,
+        });
+        CustomDirectory::Open {
+            begun: begun.map(|(time, _)| (found.begun_by, age(time))),
+            submissions: submissions.collect(),
+        }
+    }
+
+    /// The recorded end, if labellers see it.
+    pub fn seen_end(&self, name: &str) -> Option<CalculationEnd> {
+        let found = self.directories.get(name).filter(|found| !found.is_removed)?;
+        found.end.as_ref().filter(|(.., seen)| *seen <= self.now).map(|(end, ..)| end.clone())
+    }
+
+    /// Notes a submission before it is made; `None` if there were too many, or there is no directory.
+    pub fn begin_submission(&mut self, name: &str) -> Option<u32> {
+        let found = self.directories.get_mut(name).filter(|found| !found.is_removed)?;
+        let number = (1..=MAX_SUBMISSIONS).find(|number| !found.submissions.contains_key(number))?;
+        found.submissions.insert(number, (None, self.now));
+        Some(number)
+    }
+
+    pub fn end_submission(&mut self, name: &str, number: u32, id: JobId) {
+        if let Some((noted, _)) =
+            self.directories.get_mut(name).and_then(|found| found.submissions.get_mut(&number))
+        {
+            *noted = Some(id);
+        }
+    }
+
+    pub fn forget_submission(&mut self, name: &str, number: u32) {
+        if let Some(found) = self.directories.get_mut(name) {
+            found.refused.insert(number);
+            found.submissions.remove(&number);
+        }
+    }
+
+    /// The ids of the jobs of a calculation, as far as they are known.
+    pub fn submitted_ids(&self, name: &str) -> Vec<JobId> {
+        let submissions = self.directories.get(name).into_iter().flat_map(|found| found.submissions.values());
+        submissions.filter_map(|(id, _)| id.clone()).collect()
     }
 
     pub fn traces(&self, name: &str) -> Traces {
@@ -104,9 +194,39 @@ impl SharedFiles {
         found.is_some_and(|found| !std::mem::take(&mut found.excluded).is_empty())
     }
 
-    pub fn remove(&mut self, name: &str) {
-        if let Some(found) = self.directories.get_mut(name) {
-            found.is_removed = true;
+    /// Removes a directory. Its calculation must not run, and its result must be delivered or lost.
+    pub fn remove(&mut self, name: &str, why: DirectoryRemoval) {
+        let Some(found) = self.directories.get_mut(name) else { return };
+        if std::mem::replace(&mut found.is_removed, true) || found.is_damaged {
+            return;
         }
+        // A job whose id was lost cannot be cancelled. What it computes is lost with its directory.
+        if matches!(why, DirectoryRemoval::Lost { .. })
+            && found.submissions.values().any(|(id, _)| id.is_none())
+        {
+            found.is_running = false;
+            return;
+        }
+        let has_result = found.truth.is_some_and(|truth| truth != Err(FailureClass::NodeFailure));
+        let is_left = has_result && !found.is_delivered;
+        let is_needed = match why {
+            DirectoryRemoval::NotNeeded | DirectoryRemoval::OtherProgram => return,
+            // What runs is cancelled, if its id is known.
+            DirectoryRemoval::Lost { has_newer: true } => return,
+            DirectoryRemoval::LeftOver => found.is_running || is_left && !found.is_unwanted,
+            DirectoryRemoval::Delivered | DirectoryRemoval::Lost { has_newer: false } => {
+                found.is_running || is_left
+            }
+        };
+        if is_needed {
+            let running = if found.is_running { "runs" } else { "is not delivered" };
+            self.fail(format!("the directory of calculation {name}, which {running}, is removed: {why:?}"));
+        }
+    }
+
+    /// Directories that were made some time ago.
+    pub fn older_than(&self, age: Time) -> Vec<String> {
+        let is_old = |found: &CalculationFiles| !found.is_removed && found.made + age <= self.now;
+        self.directories.iter().filter(|(_, found)| is_old(found)).map(|(name, _)| name.clone()).collect()
     }
 }

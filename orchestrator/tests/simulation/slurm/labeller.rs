@@ -1,4 +1,4 @@
-//! What a labeller does whose calculations are Slurm jobs: the shell around the decisions of `workers::labeller`, step by
+//! What a labeller does whose calculations are jobs: the shell around the decisions of `workers::labeller`, step by
 //! step. It runs beside the renewal of the lease, and is dropped when the labeller turns to something else.
 //!
 //! It is a coroutine: it waits for the answer to one request after the other, which the world gives in virtual time.
@@ -10,29 +10,28 @@ use std::pin::Pin;
 use std::rc::Rc;
 use std::task::Poll;
 
+use batch::{CommandOutput, JobId};
 use dft::{Exit, FailureClass, RetryAdjustment};
+use store::PastCalculation;
 use store::records::Lease;
 use workers::labeller::decisions::{
-    CalculationEnd, CalculationState, EarlierStep, EndReason, Inspection, InspectionStep, JobDirectory,
-    SqueueJob, SubmissionRetry, SubmissionStep, Traces, WaitStep, failure_at, infer_end, is_listed,
-    jobs_to_cancel,
+    CalculationEnd, CalculationState, EarlierStep, EndReason, failure_at, is_left_over,
 };
 
 use super::super::calculation::CalculationResult;
 use super::super::fault::Time;
 use super::super::planted::PlantedBug;
-use super::files::{CalculationFiles, SETTLE_TIME, SharedFiles};
+use super::dialect::Dialect;
+use super::files::{CalculationFiles, DirectoryRemoval, SharedFiles};
 
-/// Time between two questions to Slurm.
-pub const SQUEUE_INTERVAL: Time = 20_000;
 /// Time between two tries of a submission.
-const RETRY_INTERVAL: Time = 3_000;
+pub(super) const RETRY_INTERVAL: Time = 3_000;
 /// First and longest time between two looks at a directory.
-const POLL_INTERVALS: [Time; 2] = [400, 2_000];
+pub(super) const POLL_INTERVALS: [Time; 2] = [400, 2_000];
 /// First and longest time between two tries while Slurm accepts no job.
-const FULL_PAUSES: [Time; 2] = [2_000, 60_000];
-/// How long a cancelled job may take to end.
-const CANCEL_TIMEOUT: Time = 5_000;
+pub(super) const FULL_PAUSES: [Time; 2] = [2_000, 60_000];
+/// Directories younger than this are not cleaned up.
+const MIN_AGE: Time = 60_000;
 
 /// What a labeller waits for.
 #[derive(Clone, Debug)]
@@ -48,6 +47,14 @@ pub enum Request {
     Record(String),
     /// The labeller waits for this calculation from now on.
     Take(String),
+    /// To another batch system: submit the job of this calculation under this number.
+    Submit(String, u32),
+    /// The state of the job with this id.
+    Poll(JobId),
+    /// Cancel the job with this id.
+    Delete(JobId),
+    /// What the store knows of the attempt that made a calculation.
+    Past(i64, u32),
 }
 
 /// The answer.
@@ -58,6 +65,9 @@ pub enum Answer {
     Text(Option<String>),
     /// Slurm accepts no further job.
     Full,
+    /// Of a command of another batch system.
+    Output(CommandOutput),
+    Past(Option<PastCalculation>),
 }
 
 /// How it ends.
@@ -71,7 +81,7 @@ pub enum TaskEnd {
 }
 
 /// Why a labeller cannot go on.
-type Failing<T> = Result<T, String>;
+pub(super) type Failing<T> = Result<T, String>;
 
 /// A task of a labeller.
 pub struct SlurmTask {
@@ -94,154 +104,59 @@ pub struct LabellerIo {
     pub exchange: Rc<RefCell<Exchange>>,
     pub files: Rc<RefCell<SharedFiles>>,
     pub bug: Option<PlantedBug>,
+    /// The batch system, if it is not Slurm.
+    pub dialect: Option<Dialect>,
 }
 
 impl LabellerIo {
-    async fn request(&self, request: Request) -> Answer {
+    pub(super) async fn request(&self, request: Request) -> Answer {
         self.exchange.borrow_mut().request = Some(request);
         poll_fn(|_| self.exchange.borrow_mut().answer.take().map_or(Poll::Pending, Poll::Ready)).await
     }
 
-    async fn sleep(&self, time: Time) {
+    pub(super) async fn sleep(&self, time: Time) {
         self.request(Request::Sleep(time)).await;
     }
 
-    async fn text(&self, request: Request) -> Option<String> {
+    pub(super) async fn text(&self, request: Request) -> Option<String> {
         match self.request(request).await {
             Answer::Text(text) => text,
-            Answer::Done | Answer::Full => None,
+            Answer::Done | Answer::Full | Answer::Output(_) | Answer::Past(_) => None,
         }
     }
 
-    fn now(&self) -> Time {
+    pub(super) fn now(&self) -> Time {
         self.files.borrow().now
     }
 
-    fn look(&self, name: &str) -> JobDirectory {
-        match self.files.borrow().look(name) {
-            JobDirectory::Own { end, .. } if self.bug == Some(PlantedBug::BegunOverlooked) => {
-                JobDirectory::Own { begun: false, end }
-            }
-            found => found,
-        }
-    }
-
-    async fn ask(&self, name: &str) -> Option<Vec<SqueueJob>> {
-        let text = self.text(Request::Ask(name.to_owned())).await?;
-        Some(SqueueJob::parse_all(&text).expect("lines of squeue"))
-    }
-
-    /// Asks until Slurm answers.
-    async fn jobs(&self, name: &str) -> Vec<SqueueJob> {
-        loop {
-            match self.ask(name).await {
-                Some(jobs) => return jobs,
-                None if self.bug == Some(PlantedBug::SilenceTakenAsGone) => return Vec::new(),
-                None => self.sleep(SQUEUE_INTERVAL).await,
-            }
-        }
-    }
-
-    /// As [`workers::labeller`] inspects a Slurm job.
     async fn inspect(&self, name: &str) -> Failing<CalculationState> {
-        let mut inspection = Inspection::default();
-        let first = match self.look(name) {
-            JobDirectory::Own { end: None, .. } if self.bug == Some(PlantedBug::OldAnswerBelieved) => {
-                JobDirectory::Own { begun: true, end: None }
-            }
-            found => found,
-        };
-        let mut step = inspection.looked(first);
-        loop {
-            step = match step {
-                InspectionStep::Ask => inspection.answered(self.jobs(name).await),
-                InspectionStep::Settle => {
-                    if self.bug != Some(PlantedBug::FilesBelievedAtOnce) {
-                        self.sleep(SETTLE_TIME).await;
-                    }
-                    inspection.looked(self.look(name))
-                }
-                InspectionStep::InferEnd(reported) => {
-                    let end = match self.bug {
-                        Some(PlantedBug::EndsMixedUp) => infer_end(None, &Traces::default()),
-                        _ => infer_end(reported.as_ref(), &self.files.borrow().traces(name)),
-                    };
-                    self.files.borrow_mut().record_inferred(name, end.clone());
-                    return Ok(CalculationState::Ended(end));
-                }
-                InspectionStep::Is(state) => return Ok(state),
-                InspectionStep::NotVisible(why) => return Err(why),
-            };
+        match &self.dialect {
+            Some(dialect) => Ok(self.inspect_custom(dialect, name).await),
+            None => self.inspect_slurm(name).await,
         }
     }
 
     async fn submit(&self, name: &str) -> Failing<()> {
-        let (mut retry, mut pause) = (SubmissionRetry::default(), FULL_PAUSES[0]);
-        loop {
-            match self.request(Request::Sbatch(name.to_owned())).await {
-                Answer::Text(Some(_)) => return Ok(()),
-                Answer::Full => {
-                    self.sleep(pause).await;
-                    pause = (2 * pause).min(FULL_PAUSES[1]);
-                    continue;
-                }
-                Answer::Text(None) | Answer::Done => {}
-            }
-            let (jobs, exists) = (self.jobs(name).await, self.look(name) != JobDirectory::Missing);
-            let permit = || Ok::<_, String>(self.files.borrow_mut().permit_all_nodes(name));
-            match retry.failed(&jobs, exists, permit)? {
-                SubmissionStep::Wait => return Ok(()),
-                SubmissionStep::Again => self.sleep(RETRY_INTERVAL).await,
-                SubmissionStep::Refused => return Err(format!("Slurm refuses {name}")),
-            }
+        match &self.dialect {
+            Some(dialect) => self.submit_custom(dialect, name).await,
+            None => self.submit_slurm(name).await,
         }
     }
 
     async fn wait(&self, name: &str) -> Failing<Option<CalculationEnd>> {
-        let (mut pause, mut asked) = (POLL_INTERVALS[0], self.now());
-        loop {
-            if let JobDirectory::Own { end: Some(end), .. } = self.look(name) {
-                return Ok(Some(end));
-            }
-            if self.now() - asked >= SQUEUE_INTERVAL {
-                let mut names = self.text(Request::List).await;
-                if self.bug == Some(PlantedBug::SilenceTakenAsGone) {
-                    names.get_or_insert_default();
-                }
-                if !is_listed(names.as_deref(), name) {
-                    match self.inspect(name).await?.while_waiting() {
-                        WaitStep::Read(end) => return Ok(Some(end)),
-                        WaitStep::Submit => {
-                            self.files.borrow_mut().check_not_begun(name);
-                            self.submit(name).await?;
-                        }
-                        WaitStep::Wait => {}
-                        WaitStep::Abandon => return Ok(None),
-                    }
-                }
-                asked = self.now();
-            }
-            self.sleep(pause).await;
-            pause = (pause * 5 / 4).min(POLL_INTERVALS[1]);
+        match &self.dialect {
+            Some(dialect) => self.wait_custom(dialect, name).await,
+            None => self.wait_slurm(name).await,
         }
     }
 
     /// Ends what is left of a calculation and removes its directory.
-    async fn clear(&self, name: &str) -> Failing<()> {
-        let away = || "Slurm does not answer".to_owned();
-        let started = self.now();
-        loop {
-            let jobs = self.ask(name).await.ok_or_else(away)?;
-            let ids: Vec<_> = jobs_to_cancel(&jobs).iter().filter_map(|id| id.number()).collect();
-            if !ids.is_empty() {
-                self.text(Request::Cancel(ids)).await.ok_or_else(away)?;
-            }
-            if jobs.iter().all(SqueueJob::is_over) || self.now() - started > CANCEL_TIMEOUT {
-                break;
-            }
-            self.sleep(200).await;
+    async fn clear(&self, name: &str, why: DirectoryRemoval) -> Failing<()> {
+        match &self.dialect {
+            Some(dialect) => self.cancel_custom(dialect, name).await?,
+            None => self.cancel_slurm(name).await?,
         }
-        self.files.borrow_mut().remove(name);
+        self.files.borrow_mut().remove(name, why);
         Ok(())
     }
 
@@ -253,7 +168,9 @@ impl LabellerIo {
             let state = self.inspect(name).await?;
             match state.of_earlier(found.is_some()) {
                 EarlierStep::Leave => {}
-                EarlierStep::Clear => self.clear(name).await?,
+                EarlierStep::Clear => {
+                    self.clear(name, DirectoryRemoval::Lost { has_newer: found.is_some() }).await?
+                }
                 EarlierStep::Take => {
                     let is_ready = state == CalculationState::Ready;
                     if is_ready {
@@ -285,7 +202,7 @@ impl LabellerIo {
             self.submit(&name).await?;
         }
         let Some(end) = self.wait(&name).await? else {
-            self.clear(&name).await?;
+            self.clear(&name, DirectoryRemoval::Lost { has_newer: false }).await?;
             return Ok(TaskEnd::Result(CalculationResult::Failure(FailureClass::NodeFailure), None));
         };
         let result = self.read(&name, &end);
@@ -293,12 +210,14 @@ impl LabellerIo {
         let result = match result {
             Ok(energy) => CalculationResult::Label(energy),
             Err(FailureClass::OtherProgram) => {
-                self.files.borrow_mut().remove(&name);
+                self.files.borrow_mut().remove(&name, DirectoryRemoval::OtherProgram);
                 return Err("another program has calculated".to_owned());
             }
             Err(class) => {
                 use FailureClass::{Crashed, NodeFailure, OutOfMemory};
-                if let (Crashed | NodeFailure | OutOfMemory, Some(node)) = (class, &end.node) {
+                if let (Crashed | NodeFailure | OutOfMemory, Some(node)) = (class, &end.node)
+                    && self.dialect.is_none()
+                {
                     self.request(Request::Record(format!("{name}@{node}"))).await;
                 }
                 CalculationResult::Failure(class)
@@ -314,7 +233,9 @@ impl LabellerIo {
             true => failed.map(|(_, node)| node.to_owned()).collect(),
             false => BTreeSet::new(),
         };
-        let files = CalculationFiles { job: lease.job, adjustments, excluded, ..CalculationFiles::default() };
+        let made = self.now();
+        let files =
+            CalculationFiles { job: lease.job, made, adjustments, excluded, ..CalculationFiles::default() };
         self.files.borrow_mut().directories.insert(name.to_owned(), files);
     }
 
@@ -330,14 +251,45 @@ impl LabellerIo {
         }
     }
 
-    /// Makes a label.
-    pub async fn label(self, lease: Box<Lease>, adjustments: BTreeSet<RetryAdjustment>) -> TaskEnd {
+    /// Removes directories that killed labellers left and that nobody needs.
+    async fn clean_up(&self) -> Failing<()> {
+        let old = self.files.borrow().older_than(MIN_AGE);
+        for name in old {
+            let (job, attempt) = name.split_once('.').expect("job and attempt");
+            let (job, attempt) = (job.parse().expect("a number"), attempt.parse().expect("a number"));
+            let Answer::Past(Some(past)) = self.request(Request::Past(job, attempt)).await else { continue };
+            if past.wanted && self.bug != Some(PlantedBug::WantedRemoved) {
+                continue;
+            }
+            let is_its = past.calculation.as_ref().is_some_and(|text| directory_of(text) == name);
+            let state = if is_its { Some(self.inspect(&name).await?) } else { None };
+            let past = match self.bug {
+                Some(PlantedBug::WantedRemoved) => PastCalculation { wanted: false, ..past },
+                _ => past,
+            };
+            if is_left_over(&past, state.as_ref()) {
+                self.files.borrow_mut().remove(&name, DirectoryRemoval::LeftOver);
+            }
+        }
+        Ok(())
+    }
+
+    /// Makes a label. A labeller `cleans` up before its first one.
+    pub async fn label(
+        self,
+        lease: Box<Lease>,
+        adjustments: BTreeSet<RetryAdjustment>,
+        cleans: bool,
+    ) -> TaskEnd {
+        if cleans && let Err(why) = self.clean_up().await {
+            return TaskEnd::LabellerFails(why);
+        }
         self.make(lease, adjustments).await.unwrap_or_else(TaskEnd::LabellerFails)
     }
 
     /// Ends a calculation that is no longer needed.
     pub async fn stop(self, name: String) -> TaskEnd {
-        match self.clear(&name).await {
+        match self.clear(&name, DirectoryRemoval::NotNeeded).await {
             Ok(()) => TaskEnd::Cleared,
             Err(why) => TaskEnd::LabellerFails(why),
         }

@@ -1,10 +1,13 @@
-//! A stand-in for Slurm: its queue, nodes and daemon, with commands that take time, are refused or lose their replies. It
-//! answers in the words of `squeue`, which the labeller's own parser reads.
+//! A stand-in for a batch system: its queue, nodes and daemon, with commands that take time, are refused or lose their replies.
+//! It answers in the words of `squeue`, or in those of PBS or LSF, which the labeller's own parsers read.
 
+mod custom_labeller;
+mod dialect;
 mod fault;
 mod files;
 mod labeller;
 mod requests;
+mod slurm_labeller;
 
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
@@ -14,9 +17,12 @@ use std::rc::Rc;
 use dft::{Exit as ProgramExit, FailureClass, RetryAdjustment};
 use workers::labeller::decisions::{CalculationEnd, EndReason};
 
+use super::event::Event;
 use super::fault::Time;
 use super::ladder::{Difficulty, Ladders};
-use super::world::{Event, World};
+use super::scenario::Scenario;
+use super::world::World;
+use dialect::Dialect;
 use fault::ENDS;
 use files::{SETTLE_TIME, SharedFiles};
 use labeller::{Answer, Request, SlurmTask};
@@ -31,9 +37,11 @@ const REPLY_TIMEOUT: Time = 10_000;
 /// What happens at Slurm, and to labellers that use it.
 #[derive(Clone, Debug)]
 pub enum SlurmEvent {
-    /// An `sbatch` arrives; its reply goes to this request of a labeller.
+    /// A submission arrives; its reply goes to this request of a labeller.
     Submitted {
         name: String,
+        /// Its number, where submissions have one.
+        submission: u32,
         excluded: BTreeSet<String>,
         client: (u32, u64),
         replies: bool,
@@ -54,6 +62,7 @@ struct BatchJob {
     id: u64,
     /// That of its directory.
     name: String,
+    submission: u32,
     excluded: BTreeSet<String>,
     state: &'static str,
     node: &'static str,
@@ -83,6 +92,8 @@ impl BatchJob {
 /// Slurm, the files of its jobs, and the labellers that use it.
 pub struct SlurmWorld {
     seed: u64,
+    /// The batch system, if it is not Slurm.
+    dialect: Option<Dialect>,
     jobs: Vec<BatchJob>,
     files: Rc<RefCell<SharedFiles>>,
     away_until: Time,
@@ -100,9 +111,10 @@ pub struct SlurmWorld {
 }
 
 impl SlurmWorld {
-    pub fn new(seed: u64) -> Self {
+    pub fn new(seed: u64, scenario: &Scenario) -> Self {
         Self {
             seed,
+            dialect: scenario.custom.then(|| Dialect::of(seed)),
             jobs: Vec::new(),
             files: Rc::default(),
             away_until: 0,
@@ -122,8 +134,11 @@ impl SlurmWorld {
         self.tasks.remove(&labeller);
     }
 
-    pub fn remove_directory(&mut self, name: &str) {
-        self.files.borrow_mut().remove(name);
+    /// The store has the result of a calculation.
+    pub fn is_delivered(&mut self, name: &str) {
+        if let Some(found) = self.files.borrow_mut().directories.get_mut(name) {
+            found.is_delivered = true;
+        }
     }
 
     /// The adjustments of all calculations of a job of the label queue.
@@ -168,6 +183,9 @@ impl World {
                 let found = files.directories.iter_mut().find(|(_, found)| !found.is_removed);
                 if let Some((name, found)) = found {
                     (found.is_removed, found.is_damaged) = (true, true);
+                    // Slurm knows a job by its name; ids of other jobs are gone with the directory, and what they compute is
+                    // lost.
+                    found.is_running &= slurm.dialect.is_none();
                     let sentence = format!("the directory of {name} is gone");
                     drop(files);
                     self.tell(sentence);
@@ -178,8 +196,8 @@ impl World {
 
     pub fn slurm_event(&mut self, event: SlurmEvent) {
         match event {
-            SlurmEvent::Submitted { name, excluded, client, replies } => {
-                self.job_is_submitted(name, excluded, client, replies);
+            SlurmEvent::Submitted { name, submission, excluded, client, replies } => {
+                self.job_is_submitted((name, submission), excluded, client, replies);
             }
             SlurmEvent::Begins(id) => self.batch_job_begins(id),
             SlurmEvent::Ends(id, how) => self.batch_job_ends(id, how),
@@ -216,7 +234,7 @@ impl World {
 
     fn job_is_submitted(
         &mut self,
-        name: String,
+        (name, submission): (String, u32),
         excluded: BTreeSet<String>,
         client: (u32, u64),
         replies: bool,
@@ -228,10 +246,11 @@ impl World {
             Answer::Full
         } else {
             let id = self.slurm.jobs.len() as u64 + 1;
-            self.tell(format!("Slurm has job {id}, of calculation {name}"));
+            self.tell(format!("the batch system has job {id}, of calculation {name}"));
             let job = BatchJob {
                 id,
                 name,
+                submission,
                 excluded,
                 state: "PENDING",
                 node: "",
@@ -245,6 +264,9 @@ impl World {
             self.after(delay, Event::Slurm(SlurmEvent::Begins(id)));
             Answer::Text(Some(id.to_string()))
         };
+        if let Some(dialect) = self.slurm.dialect.clone() {
+            return self.custom_reply(&dialect, client, reply, replies);
+        }
         let (reply, delay) = match replies {
             true => (reply, self.random.between(20, 300)),
             false => (Answer::Text(None), REPLY_TIMEOUT),
@@ -252,15 +274,33 @@ impl World {
         self.after(delay, Event::Slurm(SlurmEvent::Answer(client.0, client.1, reply)));
     }
 
+    /// The answer of another batch system to a submission.
+    fn custom_reply(&mut self, dialect: &Dialect, client: (u32, u64), reply: Answer, replies: bool) {
+        // A daemon that is away, or whose reply is lost, lets the command hang, or fail.
+        let hangs = self.random.happens(50);
+        let (reply, delay) = match reply {
+            Answer::Full => (Answer::Output(dialect.full()), self.random.between(20, 300)),
+            Answer::Text(Some(id)) if replies => {
+                let number = id.parse().expect("its number");
+                (Answer::Output(dialect.submitted(number)), self.random.between(20, 300))
+            }
+            _ if hangs => (Answer::Text(None), REPLY_TIMEOUT),
+            _ => (Answer::Output(dialect.unreachable()), self.random.between(200, 3_000)),
+        };
+        self.after(delay, Event::Slurm(SlurmEvent::Answer(client.0, client.1, reply)));
+    }
+
     /// A job gets its node, unless another one of its name is unfinished.
     fn batch_job_begins(&mut self, id: u64) {
         let (now, is_away) = (self.now, self.is_slurm_away());
-        let BatchJob { ref name, state, ref excluded, .. } = *self.slurm.job(id);
+        let BatchJob { ref name, state, ref excluded, submission, .. } = *self.slurm.job(id);
         if state != "PENDING" {
             return;
         }
         let (name, excluded) = (name.clone(), excluded.clone());
-        let is_earlier = |job: &BatchJob| job.name == name && job.id < id && !job.is_over();
+        // Slurm lets a job wait for others of its name.
+        let is_singleton = self.slurm.dialect.is_none();
+        let is_earlier = |job: &BatchJob| is_singleton && job.name == name && job.id < id && !job.is_over();
         if is_away || self.slurm.jobs.iter().any(is_earlier) {
             return self.after(SCHEDULING_INTERVAL, Event::Slurm(SlurmEvent::Begins(id)));
         }
@@ -278,10 +318,12 @@ impl World {
             return self.tell(format!("job {id} does nothing"));
         }
         (job.state, job.is_calculating) = ("RUNNING", true);
-        (found.begun, found.is_running) = (Some((now, now + delay)), true);
+        (found.begun, found.begun_by, found.is_running) = (Some((now, now + delay)), submission, true);
         found.is_damaged |= delay > SETTLE_TIME;
         let number = found.job;
-        let longest = if self.random.happens(30) { 40_000 } else { 15_000 };
+        // Labellers ask other batch systems less often.
+        let long = if is_singleton { 40_000 } else { 70_000 };
+        let longest = if self.random.happens(30) { long } else { 15_000 };
         let time = self.random.between(3_000, longest);
         self.tell(format!("job {id} of calculation {name} begins on {node}"));
         let others = files.directories.values().filter(|other| other.job == number && other.is_running);
@@ -320,6 +362,7 @@ impl World {
         found.is_running = false;
         let knows_at = away_until.max(now) + self.random.between(200, 900);
         if let Some((state, class, words)) = how.map(|how| ENDS[how]) {
+            let words = self.slurm.dialect.as_ref().map_or(words, |dialect| dialect.last_words(class));
             found.log = (words.to_owned(), now);
             found.truth = Some(Err(class));
             self.tell(format!("job {id} of calculation {name} ends: {state}"));

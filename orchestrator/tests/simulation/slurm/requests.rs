@@ -5,13 +5,17 @@ use std::collections::BTreeSet;
 use std::rc::Rc;
 use std::task::{Context, Poll, Waker};
 
+use batch::{CommandOutput, JobId};
 use dft::RetryAdjustment;
 use store::CalculationRecord;
 use store::records::Lease;
 
+use super::super::event::{Event, Exit};
 use super::super::fault::{ClientKind, Time};
-use super::super::world::{Event, Exit, World};
-use super::labeller::{Answer, Exchange, LabellerIo, Request, SQUEUE_INTERVAL, SlurmTask, TaskEnd};
+use super::super::world::World;
+use super::files::DirectoryRemoval;
+use super::labeller::{Answer, Exchange, LabellerIo, Request, SlurmTask, TaskEnd};
+use super::slurm_labeller::SQUEUE_INTERVAL;
 use super::{SlurmEvent, SlurmFault};
 
 /// Time between two tries of a write while the database is busy or the disk full.
@@ -19,10 +23,19 @@ const STORE_RETRY_INTERVAL: Time = 1_000;
 
 impl World {
     /// A labeller begins to make a label.
-    pub fn begin_slurm_label(&mut self, id: u32, lease: Box<Lease>, adjustments: BTreeSet<RetryAdjustment>) {
+    pub fn begin_slurm_label(
+        &mut self,
+        id: u32,
+        lease: Box<Lease>,
+        adjustments: BTreeSet<RetryAdjustment>,
+        cleans: bool,
+    ) {
         let io = self.labeller_io();
         let exchange = Rc::clone(&io.exchange);
-        self.begin_task(id, SlurmTask { future: Box::pin(io.label(lease, adjustments)), exchange, token: 0 });
+        self.begin_task(
+            id,
+            SlurmTask { future: Box::pin(io.label(lease, adjustments, cleans)), exchange, token: 0 },
+        );
     }
 
     /// A labeller ends a calculation that is no longer needed.
@@ -37,6 +50,7 @@ impl World {
             exchange: Rc::new(RefCell::new(Exchange::default())),
             files: Rc::clone(&self.slurm.files),
             bug: self.bug,
+            dialect: self.slurm.dialect.clone(),
         }
     }
 
@@ -86,7 +100,25 @@ impl World {
                 ids.into_iter().for_each(|id| self.cancel_batch_job(id));
                 (Answer::Text(Some(String::new())), delay)
             }
-            Request::Sbatch(name) => return self.labeller_submits(id, token, name),
+            Request::Sbatch(name) => return self.labeller_submits(id, token, (name, 0)),
+            Request::Submit(name, number) => return self.labeller_submits(id, token, (name, number)),
+            Request::Poll(ref job) | Request::Delete(ref job) => {
+                let deletes = matches!(request, Request::Delete(_));
+                (self.ask_about(job, deletes), delay)
+            }
+            Request::Past(job, attempt) => {
+                let past = self.store.read(now, async |store| store.past_calculation(job, attempt).await);
+                match past {
+                    Ok(past) => {
+                        self.note_unwanted(job, attempt);
+                        (Answer::Past(past), 1)
+                    }
+                    Err(_) => {
+                        let again = SlurmEvent::Repeats(id, token, request);
+                        return self.after(STORE_RETRY_INTERVAL, Event::Slurm(again));
+                    }
+                }
+            }
             Request::Take(calculation) => {
                 self.labeller_takes(id, calculation);
                 (Answer::Done, 0)
@@ -108,6 +140,15 @@ impl World {
         matches!(request, Request::List) && self.slurm.list.as_ref().is_some_and(|(made, _)| recent(*made))
     }
 
+    /// Removes the directory of a calculation whose result is delivered.
+    pub fn remove_directory(&mut self, calculation: &str) {
+        let mut files = self.slurm.files.borrow_mut();
+        files.remove(calculation, DirectoryRemoval::Delivered);
+        let broken = files.broken.take();
+        drop(files);
+        broken.into_iter().for_each(|broken| self.fail(broken));
+    }
+
     /// The list that labellers share, made again if it is old.
     fn list_of_jobs(&mut self) -> String {
         if !self.has_list(&Request::List) {
@@ -118,8 +159,37 @@ impl World {
         self.slurm.list.as_ref().map(|(_, names)| names.clone()).unwrap_or_default()
     }
 
-    /// `sbatch` is under way; it goes on if its labeller is killed.
-    fn labeller_submits(&mut self, id: u32, token: u64, name: String) {
+    /// Notes whether the job of a calculation is over, for what must hold when the directory is removed.
+    fn note_unwanted(&mut self, job: i64, attempt: u32) {
+        let (open,): (i64,) = self
+            .ask(&format!("SELECT count(*) FROM job WHERE number = {job} AND state IN ('queued', 'leased')"));
+        let mut files = self.slurm.files.borrow_mut();
+        if let Some(found) = files.directories.get_mut(&format!("{job}.{attempt}")) {
+            found.is_unwanted = open == 0;
+        }
+    }
+
+    /// Asks another batch system for the state of a job, or cancels the job.
+    fn ask_about(&mut self, id: &JobId, deletes: bool) -> Answer {
+        let dialect = self.slurm.dialect.clone().expect("another batch system");
+        if self.is_slurm_away() {
+            return if self.random.happens(50) {
+                Answer::Text(None)
+            } else {
+                Answer::Output(dialect.unreachable())
+            };
+        }
+        let (now, number) = (self.now, dialect.number(id));
+        if deletes {
+            self.cancel_batch_job(number);
+            return Answer::Output(CommandOutput { success: true, ..CommandOutput::default() });
+        }
+        let state = self.slurm.known(now).find(|job| job.id == number).map(|job| job.state);
+        Answer::Output(dialect.state(number, state))
+    }
+
+    /// A submission is under way; it goes on if its labeller is killed.
+    fn labeller_submits(&mut self, id: u32, token: u64, (name, submission): (String, u32)) {
         let trouble =
             (!self.slurm.next_submissions.is_empty()).then(|| self.slurm.next_submissions.remove(0));
         let late = match trouble {
@@ -133,7 +203,7 @@ impl World {
         let event = match excluded {
             Some(excluded) => {
                 let replies = trouble != Some(SlurmFault::ReplyLost);
-                SlurmEvent::Submitted { name, excluded, client: (id, token), replies }
+                SlurmEvent::Submitted { name, submission, excluded, client: (id, token), replies }
             }
             // There is no script.
             None => SlurmEvent::Answer(id, token, Answer::Text(None)),

@@ -8,19 +8,18 @@ use dft::Exit;
 
 use super::super::calculation_runner::{CalculationEnd, EndReason};
 use super::super::log::last_lines;
+use super::super::slurm::Traces;
 use super::job::{BEGUN, CustomJob};
 
 /// Infers how a calculation ended whose job is over or unknown and whose runner recorded no end: from what the batch system has written
 /// into the job's output.
-pub(super) fn infer_end(
+pub fn infer_custom_end(
     scheduler: &CustomScheduler,
-    job: &CustomJob,
-    number: u32,
     id: Option<&JobId>,
     state: PolledState,
+    traces: &Traces,
 ) -> CalculationEnd {
-    let log = job.log(number);
-    let text = last_lines(&log);
+    let text = traces.log();
     let line_with = |texts: &[String]| {
         text.lines().rfind(|line| texts.iter().any(|text| line.contains(text))).map(str::to_owned)
     };
@@ -46,11 +45,17 @@ pub(super) fn infer_end(
     CalculationEnd {
         how: EndReason::Ended(exit),
         program: PathBuf::new(),
-        seconds: seconds(&job.directory.join(BEGUN), &log),
+        seconds: traces.seconds(),
         memory: 0,
         node: None,
         remark: Some(remark),
     }
+}
+
+/// What the submission with this number has left.
+pub(super) fn traces(job: &CustomJob, number: u32) -> Traces {
+    let log = job.log(number);
+    Traces::new(last_lines(&log), seconds(&job.directory.join(BEGUN), &log))
 }
 
 /// Time from the begin of a job to the last entry of its log, s.
@@ -92,7 +97,8 @@ mod tests {
             ("=>> PBS: job killed: mem 2097152kb exceeded limit 1048576kb", Exit::OutOfMemory),
         ] {
             fs::write(job.log(2), log).unwrap();
-            let end = infer_end(&scheduler, &job, 2, Some(&JobId::from(7)), PolledState::Completed);
+            let end =
+                infer_custom_end(&scheduler, Some(&JobId::from(7)), PolledState::Completed, &traces(&job, 2));
             assert_eq!(end.how, EndReason::Ended(exit), "{log}");
             let remark = end.remark.unwrap();
             assert!(
@@ -101,7 +107,8 @@ mod tests {
             );
             assert!(exit == Exit::LostNode || remark.contains("the job's log says: =>> PBS"), "{remark}");
         }
-        let remark = infer_end(&scheduler, &job, 1, None, PolledState::Vanished).remark.unwrap();
+        let remark =
+            infer_custom_end(&scheduler, None, PolledState::Vanished, &traces(&job, 1)).remark.unwrap();
         assert!(remark.starts_with("its job was submitted to PBS, whose answer was lost"), "{remark}");
     }
 }

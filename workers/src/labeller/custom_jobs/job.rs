@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 pub(super) const BEGUN: &str = "begun";
 /// Largest number of submissions of a calculation: a job may be submitted twice if an answer is lost, and again after it was cancelled
 /// before it began.
-pub(super) const MAX_SUBMISSIONS: u32 = 4;
+pub const MAX_SUBMISSIONS: u32 = 4;
 
 /// Identifies the job of a calculation.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -29,13 +29,16 @@ pub(in super::super) struct CustomJob {
 
 /// A submission of a job. Its file exists before the job is submitted.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct JobSubmission {
+pub struct JobSubmission {
     /// From 1.
     pub number: u32,
     /// `None` if the answer of the batch system was lost.
     pub id: Option<JobId>,
     /// Time since it was submitted.
     pub age: Duration,
+    /// The batch system refused an earlier submission with this number. If it has a job all the same, that one may
+    /// calculate under this number.
+    pub was_refused: bool,
 }
 
 impl CustomJob {
@@ -67,7 +70,8 @@ impl CustomJob {
         let time = fs::symlink_metadata(&path).and_then(|file| file.modified()).ok()?;
         let text = result_file::read(&path).ok().and_then(|bytes| String::from_utf8(bytes).ok());
         let id = text.and_then(|text| JobId::at_start_of(&text));
-        Some(JobSubmission { number, id, age: time.elapsed().unwrap_or_default() })
+        let was_refused = self.refusal(number).symlink_metadata().is_ok();
+        Some(JobSubmission { number, id, age: time.elapsed().unwrap_or_default(), was_refused })
     }
 
     /// Notes a submission before it is made; `None` if there were too many.
@@ -86,13 +90,18 @@ impl CustomJob {
         File::options().write(true).open(self.note(number))?.write_all(id.as_str().as_bytes())
     }
 
-    /// Forgets a submission that the batch system refused.
+    /// Forgets a submission that the batch system refused, so that its number is free. That it was refused stays known.
     pub fn forget_submission(&self, number: u32) -> io::Result<()> {
+        File::create(self.refusal(number))?;
         fs::remove_file(self.note(number))
     }
 
     fn note(&self, number: u32) -> PathBuf {
         self.directory.join(format!("submission-{number}"))
+    }
+
+    fn refusal(&self, number: u32) -> PathBuf {
+        self.directory.join(format!("submission-{number}.refused"))
     }
 }
 
@@ -125,6 +134,8 @@ mod tests {
         job.forget_submission(1).unwrap();
         let numbers: Vec<_> = (0..4).map(|_| job.begin_submission().unwrap()).collect();
         assert_eq!(numbers, [Some(1), Some(3), Some(4), None]);
+        let refused: Vec<_> = job.submissions().into_iter().map(|one| one.was_refused).collect();
+        assert_eq!(refused, [true, false, false, false]);
         assert_eq!(job.begun(), None);
         std::os::unix::fs::symlink("3", home.path().join(BEGUN)).unwrap();
         assert_eq!(job.begun().map(|(number, _)| number), Some(3));

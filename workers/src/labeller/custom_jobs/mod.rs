@@ -8,37 +8,38 @@
 //! their end; while it does not answer, nothing is concluded.
 
 mod end;
+mod inspection;
 mod job;
 mod script;
+mod submission;
 
 use std::io;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use ::batch::{CustomClient, CustomError, CustomScheduler, PolledState};
+use ::batch::{CustomClient, CustomError, CustomScheduler, JobId, PolledState};
 use dft::PassedEnvironment;
 use store::StoreError;
 use tokio::time::sleep;
 use tracing::{info, warn};
 
 use super::batch_job::{
-    CANCEL_TIMEOUT, COMMAND_TIMEOUT, MAX_POLL_INTERVAL, MAX_REFUSALS, MIN_POLL_INTERVAL, RETRY_INTERVAL,
+    CANCEL_TIMEOUT, COMMAND_TIMEOUT, MAX_POLL_INTERVAL, MIN_POLL_INTERVAL, RETRY_INTERVAL,
     SCRATCH_NOT_SHARED, own_user, settle,
 };
 use super::calculation_runner::{Calculation, CalculationEnd};
 use super::calculation_state::{CalculationState, WaitStep};
 use super::file_error::file_error;
 use super::private_directory;
-use job::{JobSubmission, MAX_SUBMISSIONS};
 
+pub use end::infer_custom_end;
+pub use inspection::{CustomDirectory, CustomInspection, CustomStep};
 pub(super) use job::CustomJob;
+pub use job::{JobSubmission, MAX_SUBMISSIONS};
+pub use submission::{AfterFailure, CustomSubmission, SubmissionFailure};
 
 /// Time between two questions to the batch system about a job.
 const QUESTION_INTERVAL: Duration = Duration::from_secs(30);
-/// A batch system may not know a job for this long after it was submitted.
-const NOT_YET_KNOWN: Duration = Duration::from_secs(60);
-/// A job whose id was lost is over this long after its time limit.
-const LOST_MARGIN: Duration = Duration::from_secs(600);
 
 /// Access to a custom batch system for calculations.
 pub(super) struct CustomJobs {
@@ -71,7 +72,7 @@ impl CustomJobs {
     /// calculation.
     pub async fn submit(&self, job: &CustomJob) -> Result<(), StoreError> {
         let failed = |error| file_error(&job.directory, error);
-        let mut refused = 0;
+        let mut submission = CustomSubmission::default();
         loop {
             let Some(number) = job.begin_submission().map_err(failed)? else {
                 let why =
@@ -87,79 +88,49 @@ impl CustomJobs {
             if self.is_full.swap(false, Ordering::Relaxed) {
                 info!("{} accepts jobs again", job.scheduler);
             }
-            match submitted {
+            let error = match submitted {
                 Ok(id) => return job.end_submission(number, &id).map_err(failed),
-                // There may be a job, which may calculate.
-                Err(CustomError::TimedOut { .. }) => {}
-                Err(error) => {
-                    let is_wrong = matches!(error, CustomError::UnexpectedOutput { .. });
-                    if !is_wrong {
-                        job.forget_submission(number).map_err(failed)?;
-                    }
-                    refused += 1;
-                    if refused >= MAX_REFUSALS || is_wrong || error.is_missing() {
-                        return Err(job_error(job, format_args!("cannot submit its job: {error}")));
-                    }
-                }
+                Err(error) => error,
+            };
+            let AfterFailure { forget, again } = submission.failed(SubmissionFailure::of(&error));
+            if forget {
+                job.forget_submission(number).map_err(failed)?;
+            }
+            if !again {
+                return Err(job_error(job, format_args!("cannot submit its job: {error}")));
             }
             sleep(RETRY_INTERVAL).await;
         }
     }
 
     pub async fn inspect(&self, job: &CustomJob) -> Result<CalculationState, StoreError> {
-        if let Some(known) = poll_directory(job) {
-            return Ok(known);
-        }
-        if job.scheduler != self.client.scheduler().name {
-            return Ok(CalculationState::Elsewhere);
-        }
-        match job.begun() {
-            Some(begun) => self.begun_job(job, begun).await,
-            None => self.waiting_job(job).await,
+        let mut inspection = CustomInspection::new(Duration::from_secs(job.time_limit));
+        let mut step = inspection.looked(self.look(job));
+        loop {
+            step = match step {
+                CustomStep::Ask(id) => inspection.answered(self.poll(job, &id).await?),
+                CustomStep::Settle => {
+                    settle(&job.directory).await;
+                    inspection.looked(self.look(job))
+                }
+                CustomStep::InferEnd { number, id, state } => {
+                    let traces = end::traces(job, number);
+                    let end = infer_custom_end(self.client.scheduler(), id.as_ref(), state, &traces);
+                    end.write(&job.directory).map_err(|error| file_error(&job.directory, error))?;
+                    return Ok(CalculationState::Ended(end));
+                }
+                CustomStep::Is(state) => return Ok(state),
+            };
         }
     }
 
-    /// The state of a job of which a submission calculates.
-    async fn begun_job(
-        &self,
-        job: &CustomJob,
-        (number, age): (u32, Duration),
-    ) -> Result<CalculationState, StoreError> {
-        let submission = job.submissions().into_iter().find(|one| one.number == number);
-        let state = match &submission {
-            Some(submission) if submission.id.is_some() => self.poll(job, submission).await?,
-            _ if age < Duration::from_secs(job.time_limit).saturating_add(LOST_MARGIN) => {
-                PolledState::Running
+    fn look(&self, job: &CustomJob) -> CustomDirectory {
+        match look_without(job) {
+            CustomDirectory::Open { .. } if job.scheduler != self.client.scheduler().name => {
+                CustomDirectory::Foreign
             }
-            _ => PolledState::Vanished,
-        };
-        if state.is_alive() {
-            return Ok(CalculationState::Running);
+            found => found,
         }
-        settle(&job.directory).await;
-        if let Some(end) = CalculationEnd::read(&job.directory) {
-            return Ok(CalculationState::Ended(end));
-        }
-        let id = submission.and_then(|submission| submission.id);
-        let end = end::infer_end(self.client.scheduler(), job, number, id.as_ref(), state);
-        end.write(&job.directory).map_err(|error| file_error(&job.directory, error))?;
-        Ok(CalculationState::Ended(end))
-    }
-
-    /// The state of a job that has not begun.
-    async fn waiting_job(&self, job: &CustomJob) -> Result<CalculationState, StoreError> {
-        for submission in job.submissions() {
-            if submission.id.is_some() && self.poll(job, &submission).await?.is_alive() {
-                return Ok(CalculationState::Running);
-            }
-        }
-        settle(&job.directory).await;
-        // It may have begun and ended meanwhile.
-        Ok(match (CalculationEnd::read(&job.directory), job.begun()) {
-            (Some(end), _) => CalculationState::Ended(end),
-            (None, Some(_)) => CalculationState::Running,
-            (None, None) => CalculationState::Ready,
-        })
     }
 
     /// Waits for the end, and submits the job if it is over before it began; `None` if its directory was removed.
@@ -206,14 +177,10 @@ impl CustomJobs {
         Ok(())
     }
 
-    /// The state of a submission. Retries until the batch system answers.
-    async fn poll(&self, job: &CustomJob, submission: &JobSubmission) -> Result<PolledState, StoreError> {
-        let Some(id) = &submission.id else { return Ok(PolledState::Vanished) };
+    /// The state of a job. Retries until the batch system answers.
+    async fn poll(&self, job: &CustomJob, id: &JobId) -> Result<PolledState, StoreError> {
         loop {
             match self.client.poll(id).await {
-                Ok(PolledState::Vanished) if submission.age < NOT_YET_KNOWN => {
-                    return Ok(PolledState::Pending);
-                }
                 Ok(state) => return Ok(state),
                 Err(error) if error.is_missing() => return Err(job_error(job, error)),
                 Err(_) => sleep(QUESTION_INTERVAL).await,
@@ -222,20 +189,30 @@ impl CustomJobs {
     }
 }
 
-/// What can be said without the batch system.
+/// The state as far as it can be known without the batch system.
 pub(super) fn poll_directory(job: &CustomJob) -> Option<CalculationState> {
+    match look_without(job) {
+        CustomDirectory::Missing => Some(CalculationState::Gone),
+        CustomDirectory::Foreign => Some(CalculationState::Elsewhere),
+        CustomDirectory::Ended(end) => Some(CalculationState::Ended(end)),
+        CustomDirectory::Open { .. } => None,
+    }
+}
+
+/// What the directory shows, whichever batch system there is now.
+fn look_without(job: &CustomJob) -> CustomDirectory {
     let exists = job.directory.symlink_metadata().is_ok();
     if exists && !private_directory::is_own(&job.directory) {
         // Another user has created a directory of that name after it was removed, or has submitted the job.
-        return Some(CalculationState::Elsewhere);
+        return CustomDirectory::Foreign;
     }
     if let Some(end) = CalculationEnd::read(&job.directory) {
-        return Some(CalculationState::Ended(end));
+        return CustomDirectory::Ended(end);
     }
     match exists {
-        _ if job.user != own_user() => Some(CalculationState::Elsewhere),
-        true => None,
-        false => Some(CalculationState::Gone),
+        _ if job.user != own_user() => CustomDirectory::Foreign,
+        true => CustomDirectory::Open { begun: job.begun(), submissions: job.submissions() },
+        false => CustomDirectory::Missing,
     }
 }
 

@@ -135,6 +135,14 @@ impl Traces {
         Self { log, seconds }
     }
 
+    pub(in super::super) fn log(&self) -> &str {
+        &self.log
+    }
+
+    pub(in super::super) fn seconds(&self) -> f64 {
+        self.seconds
+    }
+
     pub(super) fn read(directory: &Path) -> Self {
         let log = directory.join(LOG);
         let changed = |path: &Path| fs::metadata(path).and_then(|file| file.modified()).ok();

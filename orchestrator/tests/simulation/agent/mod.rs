@@ -1,25 +1,26 @@
 //! Agents on other hosts: the real protocol at both ends, and the real exchanges and pool of an agent. Stand-ins are the
 //! link with its heartbeat, and the walkers of the host.
 
+mod loss;
+mod walkers;
+
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
 use calm::Mixture;
-use tokio::sync::oneshot;
-use wire::messages::AssignmentReport;
 use wire::net::datagram::{self, AgentRegistration, SlotExchange, SlotStep};
-use wire::net::{AgentEvent, AgentInfo, LinkError, Slot, SlotReport};
-use wire::transport::{Incoming, WorkItem};
+use wire::net::{AgentInfo, LinkError, Slot, SlotReport};
 use workers::agent::{AgentCore, ExchangeEnd};
 
+use super::event::Event;
 use super::fault::{Direction, FIRST_AGENT, Time};
 use super::planted::PlantedBug;
 use super::refit::RunRefits;
-use super::scenario::SEED_STRUCTURES;
-use super::world::{Event, World};
-use crate::common::scripted::advance;
-use crate::common::seed_structure;
+use super::world::World;
+use walkers::HostWalker;
+
+pub use loss::MissingAgent;
 
 /// Agents without heartbeat for this time are lost.
 pub const AGENT_TIMEOUT: Duration = Duration::from_secs(15);
@@ -69,21 +70,14 @@ enum Conversation {
     Leave,
 }
 
-/// A walker of an agent.
-#[derive(Default)]
-struct HostWalker {
-    reply: Option<oneshot::Receiver<Option<WorkItem>>>,
-    work: Option<WorkItem>,
-    /// Number of its assignments.
-    count: u64,
-}
-
 /// A running agent.
 pub struct AgentProcess {
     info: AgentInfo,
     process: u32,
     core: AgentCore<AgentRegistration>,
     session: u64,
+    /// Number of its registrations.
+    registrations: u64,
     /// What it starts its walkers with: the number of the version of the potential.
     setup: Vec<u8>,
     mixtures: VecDeque<Arc<Mixture>>,
@@ -123,6 +117,7 @@ impl World {
             process,
             core: AgentCore::default(),
             session: 0,
+            registrations: 0,
             setup: Vec::new(),
             mixtures: VecDeque::new(),
             walkers: (0..WALKERS).map(|_| HostWalker::default()).collect(),
@@ -301,146 +296,5 @@ impl World {
 
     fn exchange(&mut self, key: AgentKey, slot: Slot, report: SlotReport) {
         self.converse(key, Conversation::Slot(SlotExchange::new(slot, report)));
-    }
-
-    fn agent_walker_idle(&mut self, key: AgentKey, walker: u32, report: Option<AssignmentReport>) {
-        let agent = self.agents.get_mut(&key.agent).unwrap();
-        let (reply, answer) = oneshot::channel();
-        let of = &mut agent.walkers[walker as usize];
-        (of.reply, of.work) = (Some(answer), None);
-        if let Some((slot, report)) = agent.core.handle(Incoming::Idle { walker, report, reply }) {
-            self.exchange(key, slot, report);
-        }
-    }
-
-    /// A registration takes effect, and walkers begin what they were given.
-    fn agent_moves_on(&mut self, key: AgentKey) {
-        let of_process = |agent: &&mut AgentProcess| agent.process == key.process;
-        let Some(agent) = self.agents.get_mut(&key.agent).filter(of_process) else { return };
-        if let Some(joined) = agent.core.take_joined() {
-            (agent.session, agent.setup) = (joined.session, joined.setup);
-            let first = agent.core.start(joined.slots);
-            self.tell(format!("agent {} has joined run {}", key.agent, joined.session));
-            first.into_iter().for_each(|(slot, report)| self.exchange(key, slot, report));
-        }
-        for walker in 0..WALKERS {
-            let agent = self.agents.get_mut(&key.agent).unwrap();
-            let of = &mut agent.walkers[walker as usize];
-            let Some(answer) = of.reply.as_mut().and_then(|reply| reply.try_recv().ok()) else { continue };
-            (of.reply, of.work) = (None, answer);
-            of.count += 1;
-            if of.work.is_some() {
-                let (count, version) =
-                    (of.count, of.work.as_ref().map(|work| work.assignment.conditions.version));
-                let known = String::from_utf8_lossy(&agent.setup).into_owned();
-                if version.is_some_and(|version| version.to_string() != known) {
-                    self.fail(format!("agent {} has a walk of another version than {known}", key.agent));
-                }
-                let time = self.random.between(1_500, 5_000);
-                self.after(time, Event::Agent(key, AgentEventKind::WalkerFinishes(walker, count)));
-            }
-        }
-        let agent = self.agents.get_mut(&key.agent).unwrap();
-        if agent.session > 0 && agent.core.is_over() && !std::mem::replace(&mut agent.leaving, true) {
-            self.converse(key, Conversation::Leave);
-        }
-    }
-
-    fn agent_walker_finishes(&mut self, key: AgentKey, walker: u32, count: u64) {
-        let of = &self.agents[&key.agent].walkers[walker as usize];
-        let Some(WorkItem { assignment, mixture }) = of.work.as_ref().filter(|_| of.count == count) else {
-            return;
-        };
-        let is_script = |number: &usize| seed_structure(*number).structure == assignment.seed_structure;
-        let script = (0..SEED_STRUCTURES).find(is_script).expect("one of the scenario");
-        let events = self.scenario.script(script, assignment.conditions.version);
-        let report = advance(&events, assignment, mixture, None);
-        self.tell(format!(
-            "walker {walker} of agent {} reports on walk {}, assignment {}",
-            key.agent, report.walk, report.assignment
-        ));
-        self.agent_walker_idle(key, walker, Some(report));
-    }
-
-    pub fn kill_agent(&mut self, agent: u32) {
-        let Some(process) = self.agents.remove(&agent) else { return };
-        self.set_agent_alive(&process.info.id, false);
-        self.start_agent(agent, process.process + 1);
-        self.agents.get_mut(&agent).unwrap().stopped_until = self.now + RESTART_DELAY;
-    }
-
-    pub fn stop_agent(&mut self, agent: u32, until: Time) {
-        self.agents.get_mut(&agent).into_iter().for_each(|agent| agent.stopped_until = until);
-    }
-
-    pub fn mute_agent(&mut self, agent: u32, until: Time) {
-        let Some(agent) = self.agents.get_mut(&agent) else { return };
-        agent.muted_until = agent.muted_until.max(until);
-        let id = agent.info.id.clone();
-        self.set_agent_alive(&id, false);
-        self.after(until - self.now, Event::AgentHeard(id));
-    }
-
-    /// The heartbeat of an agent returns, unless its process has ended.
-    pub fn agent_heard(&mut self, id: &str) {
-        if self.agents.values().any(|agent| agent.info.id == id) {
-            self.set_agent_alive(id, true);
-        }
-    }
-
-    /// The heartbeat of an agent appears or disappears, for the run that leads.
-    pub fn set_agent_alive(&mut self, id: &str, alive: bool) {
-        let now = self.instant();
-        if let Some(run) = self.leader().and_then(|session| self.runs.get_mut(&session)) {
-            run.agents.set_alive(id, alive, now);
-        }
-    }
-
-    pub fn kill_agent_walker(&mut self, number: u32, walker: u32, crashed: bool) {
-        let Some(agent) = self.agents.get_mut(&number) else { return };
-        let key = AgentKey { agent: number, process: agent.process };
-        let of = &mut agent.walkers[walker as usize];
-        (of.reply, of.work) = (None, None);
-        of.count += 1;
-        if let Some((slot, report)) = agent.core.handle(Incoming::Lost { walker, crashed }) {
-            self.exchange(key, slot, report);
-        }
-        self.after(1_000, Event::Agent(key, AgentEventKind::WalkerStarts(walker)));
-    }
-
-    pub fn agents_expire(&mut self, session: u64) {
-        if !self.is_active(session, || Event::AgentExpiry(session)) {
-            return;
-        }
-        let now = self.instant();
-        if self.bug != Some(PlantedBug::AgentLossForgotten) {
-            self.runs.get_mut(&session).unwrap().agents.expire(now);
-        }
-        self.after(EXPIRY_INTERVAL, Event::AgentExpiry(session));
-        self.pump(session);
-    }
-
-    /// The server says what happened to an agent: one that works is not taken for another.
-    pub fn agent_event(&mut self, session: u64, event: AgentEvent) {
-        match event {
-            AgentEvent::Lost(lost) => {
-                self.tell(format!("run {session} has lost an agent on {}", lost.host));
-                let lives = |agent: &AgentProcess| agent.info == lost && agent.muted_until < self.now;
-                if Some(session) == self.leader() && self.agents.values().any(lives) {
-                    self.fail(format!("the living agent on {} is taken for dead", lost.host));
-                }
-            }
-            AgentEvent::MessageRejected(why) => {
-                self.fail(format!("run {session} rejects a message of an agent: {why}"));
-            }
-            AgentEvent::Joined(joined) => {
-                let number = joined.host.trim_start_matches("host ").parse::<u32>().unwrap_or_default();
-                let newest = self.agents.get(&number).map(|agent| (agent.info.pid, agent.info.id.clone()));
-                if newest.is_some_and(|(process, id)| process != joined.pid && id == joined.id) {
-                    self.fail(format!("a dead process of agent {number} replaces the living one"));
-                }
-            }
-            _ => {}
-        }
     }
 }
