@@ -12,7 +12,7 @@ use atoms::Species;
 use axum::extract::{RawQuery, State};
 use monitor::candidate_errors::ErrorReader;
 use serde_json::json;
-use store::{ListCursor, ListOrder, ListedCandidate, NO_LABEL_VALUE, Store, StoreError};
+use store::{JobState, ListCursor, ListOrder, ListedCandidate, NO_LABEL_VALUE, Store, StoreError};
 use wire::{WalkConditions, WalkId};
 
 use self::columns::TableRow;
@@ -27,6 +27,8 @@ const DEFAULT_ROWS: u32 = 50;
 /// Candidates read at a time when rows are filtered, and the largest number scanned for a response.
 const SCAN_ROWS: u32 = 1000;
 const MAX_SCANNED: usize = 10_000;
+/// Up to this number of jobs, those of a state lead to its candidates. With more, they are found among all candidates.
+const MAX_JOBS_OF_STATE: u32 = 100_000;
 
 /// Rows of the table.
 #[derive(Debug, Default)]
@@ -83,14 +85,15 @@ impl CandidateQuery {
         limit: usize,
         max_scanned: usize,
     ) -> Result<CandidatePage, StoreError> {
-        let window = if self.filters_rows() { SCAN_ROWS } else { SCAN_ROWS.min(limit as u32) };
+        let state = self.leading_state(store).await?;
+        let window = if self.filters_rows(state) { SCAN_ROWS } else { SCAN_ROWS.min(limit as u32) };
         let (mut page, mut place, mut elements) = (CandidatePage::default(), after, HashMap::new());
         let conditions = match self.filter {
             Some(_) => store.walk_conditions().await?,
             None => BTreeMap::new(),
         };
         loop {
-            let rows = self.rows(store, place, window).await?;
+            let rows = self.rows(store, state, place, window).await?;
             let is_last = rows.len() < window as usize;
             for row in rows {
                 page.scanned += 1;
@@ -110,45 +113,69 @@ impl CandidateQuery {
         }
     }
 
-    /// Whether rows that are read may be filtered out.
-    fn filters_rows(&self) -> bool {
-        let has_order = !matches!(self.order, TableOrder::Decision | TableOrder::Column(_));
-        let by_fate = self.fate.is_some() && has_order;
-        let by_state = self.state.is_some() && self.order != TableOrder::Queue;
+    /// Whether rows that are read may be filtered out. `leading`: see [`Self::leading_state`].
+    fn filters_rows(&self, leading: Option<JobState>) -> bool {
+        let by_fate = self.fate.is_some() && !self.is_by_decision() && leading.is_none();
+        let by_state = self.state.is_some() && self.order != TableOrder::Queue && leading.is_none();
         by_fate || by_state || self.filter.is_some()
     }
 
+    /// The state whose jobs lead to the rows; `None` where an index of candidates does.
+    async fn leading_state(&self, store: &Store) -> Result<Option<JobState>, StoreError> {
+        let Some(state) = self.state.filter(|_| self.order != TableOrder::Queue) else { return Ok(None) };
+        let is_of_walk = self.is_by_decision() && self.only_walk().is_some();
+        let has_many = is_of_walk || store.has_more_jobs(state, MAX_JOBS_OF_STATE).await?;
+        Ok((!has_many).then_some(state))
+    }
+
+    /// Rows as they are read, in an order that has an index. `leading`: see [`Self::leading_state`].
     async fn rows(
         &self,
         store: &Store,
+        leading: Option<JobState>,
         after: Option<ListCursor>,
         limit: u32,
     ) -> Result<Vec<ListedCandidate>, StoreError> {
         // By a column, the newest are sorted.
         let descending = !self.ascending || matches!(self.order, TableOrder::Column(_));
-        let walk = self.filter.as_ref().and_then(StructureFilter::only_walk);
-        if let (TableOrder::Decision | TableOrder::Column(_), Some(walk)) = (self.order, walk) {
-            let after = after.map(|place| place.decision);
-            return store.list_decided_of_walk(walk, descending, after, limit).await;
-        }
-        let order = match (self.order, self.state, self.fate.as_deref()) {
-            (TableOrder::Queue, Some(state), _) => {
-                return store.list_queue(state, after, limit).await;
-            }
-            (TableOrder::Decision | TableOrder::Column(_), _, Some(fate)) => {
-                let (origin, reason) = match fate {
-                    "control" => ("control", None),
-                    "accepted" => ("biased", None),
-                    reason => ("biased", Some(reason)),
-                };
-                let after = after.map(|place| place.decision);
-                return store.list_fate(origin, reason, descending, after, limit).await;
-            }
-            (TableOrder::Gamma, ..) => ListOrder::Gamma,
-            (TableOrder::RelativeVolume, ..) => ListOrder::Volume,
-            (TableOrder::Decision | TableOrder::Queue | TableOrder::Column(_), ..) => ListOrder::Decision,
+        let order = match self.order {
+            TableOrder::Gamma => ListOrder::Gamma,
+            TableOrder::RelativeVolume => ListOrder::Volume,
+            TableOrder::Decision | TableOrder::Queue | TableOrder::Column(_) => ListOrder::Decision,
         };
-        store.list_candidates(order, descending, after, limit).await
+        let (origin, reason) = match self.fate.as_deref() {
+            None => (None, None),
+            Some("control") => (Some("control"), None),
+            Some("accepted") => (Some("biased"), None),
+            Some(reason) => (Some("biased"), Some(reason)),
+        };
+        match (leading, self.state, self.only_walk(), origin) {
+            (_, Some(state), ..) if self.order == TableOrder::Queue => {
+                store.list_queue(state, after, limit).await
+            }
+            // What was declined has no label job.
+            (_, Some(_), ..) if reason.is_some() => Ok(Vec::new()),
+            (_, _, Some(walk), _) if self.is_by_decision() => {
+                let after = after.map(|place| place.decision);
+                store.list_decided_of_walk(walk, descending, after, limit).await
+            }
+            (Some(state), ..) => store.list_state(state, origin, (order, descending), after, limit).await,
+            (.., Some(origin)) if self.is_by_decision() => {
+                let after = after.map(|place| place.decision);
+                store.list_fate(origin, reason, descending, after, limit).await
+            }
+            _ => store.list_candidates(order, descending, after, limit).await,
+        }
+    }
+
+    /// Whether rows are read in the order of the decisions.
+    fn is_by_decision(&self) -> bool {
+        matches!(self.order, TableOrder::Decision | TableOrder::Column(_))
+    }
+
+    /// The only walk whose candidates can match.
+    fn only_walk(&self) -> Option<u32> {
+        self.filter.as_ref().and_then(StructureFilter::only_walk)
     }
 
     fn cursor_of(&self, row: &ListedCandidate) -> ListCursor {
