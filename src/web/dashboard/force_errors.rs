@@ -2,8 +2,7 @@
 
 use axum::extract::State;
 use axum::http::StatusCode;
-use monitor::{calibration, label_statistics};
-use store::Store;
+use monitor::label_statistics;
 
 use super::Dashboard;
 use super::response::{ApiError, ApiResult};
@@ -11,19 +10,23 @@ use crate::wording;
 
 /// `GET /api/errors`: what `calmwalk force-errors --json` prints, and the names of what the page shows of it.
 pub async fn force_errors(State(dashboard): State<Dashboard>) -> ApiResult {
-    dashboard.errors.get_or_compute(compute(dashboard.store)).await
+    dashboard.errors.clone().get_or_compute(compute(dashboard)).await
 }
 
-async fn compute(store: Store) -> Result<String, ApiError> {
+async fn compute(dashboard: Dashboard) -> Result<String, ApiError> {
+    let store = &dashboard.store;
     let none =
         || ApiError::new(StatusCode::NOT_FOUND, "the campaign has no label protocol, and so no labels");
     let protocol = store.protocol_in_force().await?.ok_or_else(none)?;
-    let statistics = label_statistics::read(&store, protocol.hash, None).await?;
-    let bounds = calibration::read(&store, protocol.hash, statistics.version.unwrap_or(0)).await?;
+    let statistics = label_statistics::read(store, protocol.hash, None).await?;
+    let mut calibrations = dashboard.calibrations.lock().await;
+    calibrations.read(store, protocol.hash).await?;
+    let bounds = calibrations.summary(statistics.version.unwrap_or(0));
+    drop(calibrations);
     // The intervals may take seconds.
     let json = move || {
         let mut json = wording::json::force_errors_for_page(&statistics, &protocol);
-        json["calibration"] = wording::json::error_bounds(&bounds.summary());
+        json["calibration"] = wording::json::error_bounds(&bounds);
         json.to_string()
     };
     let json = tokio::task::spawn_blocking(json).await;
