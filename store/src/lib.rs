@@ -68,7 +68,7 @@ pub use jobs::{
 };
 pub use label_values::{FinishedStructure, LabelValue, QueuedStructure};
 pub use labelled::{ArrivalSum, FailedCandidate, LabelArrival, LabelledCandidate};
-pub use listing::{ListCursor, ListOrder, ListedCandidate, NO_LABEL_VALUE};
+pub use listing::{ListCursor, ListLimits, ListOrder, ListedCandidate, NO_LABEL_VALUE};
 pub use location::{Location, ServerUrl};
 pub use lock::CampaignLock;
 pub use lower_states::{LowerState, LowerStateChange, LowerStateRule, OnLowerState, StateResult};

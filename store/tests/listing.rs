@@ -2,8 +2,8 @@
 
 use serde_json::json;
 use store::{
-    CandidateRecord, Fate, JobState, ListCursor, ListOrder, ListedCandidate, NewProtocol, RelabelRequest,
-    Store,
+    CandidateRecord, Fate, JobState, ListCursor, ListLimits, ListOrder, ListedCandidate, NewProtocol,
+    RelabelRequest, Store,
 };
 use wire::messages::DeclineReason;
 use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
@@ -142,7 +142,50 @@ async fn candidates_of_a_state_are_those_of_all_with_that_state() {
         }
     }
     // Queued, leased, labelled, failed, dropped, superseded; each of both origins, then of control walks.
-    assert_eq!(numbers[..12], [3, 1, 3, 1, 7, 3, 5, 2, 3, 1, 0, 0]);
+    assert_eq!(numbers[..12], [6, 2, 3, 1, 7, 2, 5, 2, 3, 1, 0, 0]);
     assert!(store.has_more_jobs(JobState::Failed, 2).await.unwrap());
     assert!(!store.has_more_jobs(JobState::Failed, 3).await.unwrap());
+}
+
+#[tokio::test]
+async fn candidates_within_limits_are_those_of_all_within_them() {
+    let database = TestDatabase::new();
+    let store = database.create().await.with_caller_clock();
+    in_all_states(&store).await;
+    let mut numbers = Vec::new();
+    for (gamma, relative_volume) in [
+        ([Some(1.2), None], [None; 2]),
+        ([None, Some(1.2)], [None; 2]),
+        ([Some(1.1), Some(1.3)], [Some(1.01), None]),
+        ([None; 2], [None, Some(1.0)]),
+    ] {
+        let is_within = |value: Option<f64>, [low, high]: [Option<f64>; 2]| {
+            value.is_some_and(|value| {
+                low.is_none_or(|low| value >= low) && high.is_none_or(|high| value <= high)
+            })
+        };
+        for (fate, descending) in [None, Some(("control", None)), Some(("biased", Some("covered")))]
+            .into_iter()
+            .flat_map(|fate| [(fate, true), (fate, false)])
+        {
+            let all = store.list_candidates(ListOrder::Decision, descending, None, 99).await.unwrap();
+            assert_eq!(store.newest_candidate().await.unwrap(), all.len() as i64);
+            let has = |row: &&ListedCandidate| {
+                (5..30).contains(&row.decision)
+                    && is_within(row.gamma, gamma)
+                    && is_within(row.relative_volume, relative_volume)
+                    && fate.is_none_or(|(origin, reason)| {
+                        row.origin == origin && row.fate == reason.unwrap_or("accepted")
+                    })
+            };
+            let expected: Vec<_> = all.iter().filter(has).map(|row| row.decision).take(6).collect();
+            let limits = ListLimits { gamma, relative_volume };
+            let found = store.list_within(5..30, limits, fate, descending, 6).await.unwrap();
+            let found: Vec<_> = found.iter().map(|row| row.decision).collect();
+            assert_eq!(found, expected, "{limits:?} {fate:?} {descending}");
+            numbers.push(found.len());
+        }
+    }
+    assert!(numbers[..18].iter().filter(|number| **number > 0).count() > 12, "{numbers:?}");
+    assert!(numbers[18..].iter().all(|number| *number == 0), "{numbers:?}");
 }

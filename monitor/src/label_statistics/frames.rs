@@ -111,7 +111,8 @@ impl ComparedFrames {
     /// are then those of the biased walk. Atoms without finite grades and error are left out.
     pub fn add(&mut self, row: &LabelledCandidate, is_shared: bool, energy_error: Option<f64>) {
         let LabelledCandidate { seed_structure, block, original, .. } = row;
-        let (view, origin) = (block.view(), block.view().origin());
+        let view = block.view();
+        let origin = view.origin();
         let id = view.id();
         let walk = self.biased_walk(id.walk.0);
         let place = FramePlace { seed_structure: *seed_structure, walk, origin };

@@ -153,7 +153,8 @@ impl LabelStatistics {
         shared: &HashSet<ContentHash>,
     ) {
         let LabelledCandidate { block, original, label, .. } = row;
-        let (view, origin) = (block.view(), block.view().origin());
+        let view = block.view();
+        let origin = view.origin();
         let (of, is_shared) = (versions.version_of(view.id().walk.0), shared.contains(&view.id().content));
         let error = self.energies.error_per_atom(&row.structure, view.energy(), label.energy);
         if of == version {

@@ -121,6 +121,11 @@ async fn frequent_queries_use_indexes() {
         assert!(page.contains("SEARCH candidate USING INDEX candidate_structure"), "{page}");
         assert!(!page.contains("SCAN"), "{page}");
     }
+    for sql in [listing::NEWEST_WITHIN, listing::OLDEST_WITHIN] {
+        let page = plan(&file, sql).await.replace("SCAN page", "");
+        assert!(page.contains("SEARCH candidate USING INTEGER PRIMARY KEY (rowid>? AND rowid<?)"), "{page}");
+        assert!(!page.contains("SCAN") && !page.contains("TEMP B-TREE"), "{page}");
+    }
     let sum = plan(&file, label_arrivals::SUM).await;
     assert!(
         sum.contains("SCAN label USING COVERING INDEX label_of") && !sum.contains("SCAN candidate"),

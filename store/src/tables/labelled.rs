@@ -132,7 +132,8 @@ impl FromRow for LabelledCandidate {
         ORIGINAL_GRADES.verify(row)?;
         let id: String = row.get("candidate__id")?;
         let block = block(row, &id)?;
-        let (structure, content) = (block.view().structure(), block.view().id().content);
+        let view = block.view();
+        let (structure, content) = (view.structure(), view.id().content);
         if row.bytes("structure_hash")? != Some(&content.0[..]) {
             return Err(StoreError::damaged(format!("candidate {id}"), "its structure is a different one"));
         }
