@@ -318,7 +318,7 @@ walks       none yet
 mixture     version 0
 candidates  0 seen, 0 accepted
 labels      none yet
-disk        1 MB now
+disk        1.0 MB now
 ";
     assert_eq!(on_a_screen(&empty()), expected);
 }

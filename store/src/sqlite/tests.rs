@@ -124,7 +124,7 @@ async fn frequent_queries_use_indexes() {
     for sql in [listing::NEWEST_WITHIN, listing::OLDEST_WITHIN] {
         let page = plan(&file, sql).await.replace("SCAN page", "");
         assert!(page.contains("SEARCH candidate USING INTEGER PRIMARY KEY (rowid>? AND rowid<?)"), "{page}");
-        assert!(!page.contains("SCAN") && !page.contains("TEMP B-TREE"), "{page}");
+        assert!(!page.contains("SCAN"), "{page}");
     }
     let sum = plan(&file, label_arrivals::SUM).await;
     assert!(
