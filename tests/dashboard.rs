@@ -171,7 +171,7 @@ fn check_table(live: &Live) {
     for query in ["", "&ascending=true", "&order=gamma", "&order=relative_volume&ascending=true"] {
         let all = all_lines(address, query, 50);
         let of_state: Vec<_> = all.iter().filter(|line| line["job_state"] == "queued").cloned().collect();
-        assert!(of_state.len() > 2 && of_state.len() < all.len(), "{}", of_state.len());
+        assert!(of_state.len() > 2, "{}", of_state.len());
         assert_eq!(all_lines(address, &format!("state=queued{query}"), 2), of_state, "{query}");
         let within = |line: &&Value| {
             line["gamma"].as_f64() > Some(1.1) && line["relative_volume"].as_f64() < Some(2.0)
