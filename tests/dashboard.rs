@@ -167,6 +167,24 @@ fn check_table(live: &Live) {
         });
         assert!(found.len() > 1 && found.iter().eq(expected), "{fate}: {}", found.len());
     }
+    // Candidates of a state, and those within limits, are found otherwise than all.
+    for query in ["", "&ascending=true", "&order=gamma", "&order=relative_volume&ascending=true"] {
+        let all = all_lines(address, query, 50);
+        let of_state: Vec<_> = all.iter().filter(|line| line["job_state"] == "queued").cloned().collect();
+        assert!(of_state.len() > 2, "{}", of_state.len());
+        assert_eq!(all_lines(address, &format!("state=queued{query}"), 2), of_state, "{query}");
+        let within = |line: &&Value| {
+            line["gamma"].as_f64() > Some(1.1) && line["relative_volume"].as_f64() < Some(2.0)
+        };
+        let within: Vec<_> = all.iter().filter(within).cloned().collect();
+        let limits = format!("where=gamma+%3E+1.1+and+relative_volume+%3C+2{query}");
+        assert_eq!(all_lines(address, &limits, 2), within, "{query}");
+        let covered: Vec<_> = within.into_iter().filter(|line| line["fate"] == "covered").collect();
+        assert_eq!(all_lines(address, &format!("{limits}&fate=covered"), 3), covered, "{query}");
+    }
+    for nothing in ["state=failed", "state=queued&fate=covered", "where=gamma+%3E+1e9"] {
+        assert_eq!(all_lines(address, nothing, 9), Vec::<Value>::new(), "{nothing}");
+    }
     let file = get(address, "/api/candidates.extxyz?state=queued&ascending=true");
     let frames: Vec<_> = ExtxyzReader::new(file.body.as_bytes()).map(|frame| frame.unwrap()).collect();
     let waiting = all_lines(address, "state=queued&ascending=true", 50);

@@ -30,13 +30,14 @@ const SELECTION: &str = "/api/candidates.extxyz?fate=accepted&where=gamma+%3E+2.
 /// Tries of what takes long.
 const FEW_TRIES: usize = 3;
 
-const PAGES: [&str; 8] = [
+const PAGES: [&str; 9] = [
     "/",
     "/api/candidates?limit=50",
     "/api/candidates?limit=50&order=gamma",
     "/api/candidates?limit=50&order=relative_volume&ascending=true",
     "/api/candidates?limit=50&fate=too_close",
     "/api/candidates?limit=50&order=queue&state=queued",
+    "/api/candidates?limit=50&state=failed",
     "/api/candidates?limit=50&where=gamma+%3E+2.9",
     "/api/mixture",
 ];

@@ -5,7 +5,7 @@ use std::collections::btree_map::Entry;
 
 use atoms::cell::{norm, sub};
 use serde::Serialize;
-use store::{ExportCursor, ExportRow, ExportSource, Store, StoreError};
+use store::{LabelledCandidate, Store, StoreError};
 use wire::ContentHash;
 
 use crate::energy_errors::ProtocolEnergyOffsets;
@@ -67,30 +67,28 @@ impl ErrorReader {
     ) -> Result<(), StoreError> {
         let decisions: Vec<_> = page.iter().map(|(decision, _)| *decision).collect();
         let versions: BTreeMap<_, _> = page.iter().copied().collect();
-        for row in store.labelled_candidates(protocol, &decisions).await? {
-            let ExportCursor::Candidate(decision) = row.cursor else { continue };
-            let version = versions.get(&decision).copied().unwrap_or_default();
+        for row in store.labelled_of_decisions(protocol, &decisions).await? {
+            let version = versions.get(&row.decision).copied().unwrap_or_default();
             let offsets = match self.offsets.entry(version) {
                 Entry::Occupied(known) => known.into_mut(),
                 Entry::Vacant(place) => {
                     place.insert(ProtocolEnergyOffsets::fit(store, protocol, version).await?)
                 }
             };
-            found.extend(errors(&row, offsets).map(|errors| (decision, errors)));
+            found.insert(row.decision, errors(&row, offsets));
         }
         Ok(())
     }
 }
 
-fn errors(row: &ExportRow, offsets: &ProtocolEnergyOffsets) -> Option<CandidateErrors> {
-    let ExportSource::Candidate { block, .. } = &row.source else { return None };
-    let view = block.view();
+fn errors(row: &LabelledCandidate, offsets: &ProtocolEnergyOffsets) -> CandidateErrors {
+    let view = row.block.view();
     let differences: Vec<_> =
         view.forces.iter().zip(&row.label.forces).map(|(model, label)| sub(*model, *label)).collect();
-    Some(CandidateErrors {
+    CandidateErrors {
         energy: offsets.error_per_atom(&row.structure, view.energy(), row.label.energy),
         force_mae: mean(differences.iter().flatten().map(|component| component.abs())),
         max_force_error: differences.iter().map(|difference| norm(*difference)).reduce(f64::max),
         stress: row.label.stress.and_then(|label| stress_error(&row.structure, view.virial(), label)),
-    })
+    }
 }

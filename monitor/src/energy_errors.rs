@@ -121,9 +121,9 @@ impl EnergyErrors {
         self.reference.error_per_atom(structure, model, label)
     }
 
-    /// Adds a labelled structure with its energies, eV.
-    pub fn add(&mut self, structure: &Structure, model: f64, label: f64) {
-        match self.error_per_atom(structure, model, label) {
+    /// Adds a labelled structure with its [`Self::error_per_atom`].
+    pub fn add(&mut self, error: Option<f64>) {
+        match error {
             Some(error) => {
                 self.errors.add(error.abs());
                 self.sum += error.abs();

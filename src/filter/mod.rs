@@ -146,6 +146,34 @@ impl StructureFilter {
         }
     }
 
+    /// What a property of a structure that passes the filter is at least and at most; `None` without a limit, and with a limit
+    /// the property is there.
+    pub fn limits(&self, of: NumberField) -> [Option<f64>; 2] {
+        use ComparisonOperator::{Above, AtLeast, AtMost, Below, Different, Equal};
+        let both = |a: &Self, b: &Self| (a.limits(of), b.limits(of));
+        let choose = |a: Option<f64>, b: Option<f64>, choose: fn(f64, f64) -> f64| match (a, b) {
+            (Some(a), Some(b)) => Some(choose(a, b)),
+            (a, b) => a.or(b),
+        };
+        match self {
+            Self::Number(field, comparison, value) if *field == of => match comparison {
+                Equal => [Some(*value); 2],
+                Above | AtLeast => [Some(*value), None],
+                Below | AtMost => [None, Some(*value)],
+                Different => [None; 2],
+            },
+            Self::And(left, right) => {
+                let ([low_a, high_a], [low_b, high_b]) = both(left, right);
+                [choose(low_a, low_b, f64::max), choose(high_a, high_b, f64::min)]
+            }
+            Self::Or(left, right) => {
+                let ([low_a, high_a], [low_b, high_b]) = both(left, right);
+                [low_a.zip(low_b).map(|(a, b)| a.min(b)), high_a.zip(high_b).map(|(a, b)| a.max(b))]
+            }
+            Self::Number(..) | Self::Text(..) | Self::Not(_) => [None; 2],
+        }
+    }
+
     /// The property names in the expression, in order.
     pub fn names(&self) -> Vec<&'static str> {
         match self {

@@ -76,6 +76,26 @@ fn a_filter_may_allow_a_single_walk() {
     }
 }
 
+#[test]
+fn limits_of_a_property_follow_from_the_filter() {
+    for (text, limits) in [
+        ("gamma > 2", [Some(2.0), None]),
+        ("gamma = 2", [Some(2.0), Some(2.0)]),
+        ("gamma > 2 and gamma <= 5 and step = 3", [Some(2.0), Some(5.0)]),
+        ("gamma >= 2 and gamma > 3", [Some(3.0), None]),
+        ("gamma > 2 or gamma > 1", [Some(1.0), None]),
+        ("gamma = 2 or gamma = 3", [Some(2.0), Some(3.0)]),
+        ("gamma > 2 or step = 3", [None, None]),
+        ("gamma < 2 or gamma > 3", [None, None]),
+        ("not gamma > 2", [None, None]),
+        ("gamma != 2", [None, None]),
+        ("gamma_nbr > 2", [None, None]),
+    ] {
+        let filter: StructureFilter = text.parse().unwrap();
+        assert_eq!(filter.limits(NumberField::Gamma), limits, "{text}");
+    }
+}
+
 /// Whether the text contains the word, not as a part of another word.
 fn has_word(text: &str, word: &str) -> bool {
     text.split(|c: char| !c.is_ascii_alphanumeric() && c != '_').any(|found| found == word)

@@ -2,7 +2,7 @@
 
 use store::{Unlabelled, ValueRange};
 
-use crate::output::TextTable;
+use crate::output::{TextTable, count};
 
 /// A line with a title of `width` characters, then one line for each seed structure and formula, at most `most`.
 /// Empty if no label failed.
@@ -32,7 +32,8 @@ pub fn describe(unlabelled: &[Unlabelled], width: usize, most: usize) -> String 
     };
     let title = "unlabelled";
     format!(
-        "{title:<width$}the labels of {failed} structures failed, which leaves these ranges without labels:\n{table}{more}"
+        "{title:<width$}the labels of {} failed, which leaves these ranges without labels:\n{table}{more}",
+        count(failed, "structure")
     )
 }
 

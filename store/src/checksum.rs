@@ -9,7 +9,7 @@
 
 use crc32fast::Hasher;
 
-use crate::database::row::SqlRow;
+use crate::database::row::{Index, SqlRow};
 use crate::database::value::{ColumnType, SqlValue, replace_nul};
 use crate::error::{Result, StoreError};
 
@@ -40,7 +40,7 @@ struct RowColumn {
 pub enum Names {
     /// The table's own names.
     Plain,
-    /// `table__column`.
+    /// `table__column`, one after the other as [`joined`] selects them.
     Joined,
 }
 
@@ -258,7 +258,20 @@ impl CheckedTable {
 
     /// Computes the checksum of a row whose columns have these names.
     pub fn compute(&self, row: &SqlRow, names: Names) -> Result<i64> {
-        Ok(checksum(&self.values(row, names)?))
+        let mut hasher = Hasher::new();
+        match (names, self.columns.first()) {
+            // Names are looked up once.
+            (Names::Joined, Some(first)) => {
+                let first = row.place(first.joined)?;
+                let mut columns = self.columns.iter().zip(first..);
+                columns.try_for_each(|(column, place)| add_column(&mut hasher, row, column.kind, place))?;
+            }
+            _ => {
+                let mut columns = self.columns.iter();
+                columns.try_for_each(|column| add_column(&mut hasher, row, column.kind, column.name))?;
+            }
+        }
+        Ok(hasher.finalize().into())
     }
 
     /// The values that the checksum covers, in its order.
@@ -322,8 +335,7 @@ impl CheckedColumn {
 
     /// Computes the checksum of the column in a row.
     pub fn compute(&self, row: &SqlRow) -> Result<i64> {
-        let (number, bytes): (i64, Option<Vec<u8>>) = (row.get(self.key)?, row.get(self.name)?);
-        Ok(Self::checksum(number, bytes.as_deref()))
+        Ok(Self::checksum(row.get(self.key)?, row.bytes(self.name)?))
     }
 
     /// Verifies the bytes of the column. The row must contain the number and the checksum.
@@ -364,23 +376,50 @@ pub fn checksum(values: &[SqlValue]) -> i64 {
     hasher.finalize().into()
 }
 
-/// Databases drop the sign of zero and NUL bytes in text.
 fn add(hasher: &mut Hasher, value: &SqlValue) {
-    let number = |hasher: &mut Hasher, kind: u8, bits: Option<[u8; 8]>| {
-        hasher.update(&[kind, u8::from(bits.is_some())]);
-        hasher.update(&bits.unwrap_or_default());
-    };
     match value {
-        SqlValue::Integer(value) => number(hasher, b'i', value.map(i64::to_le_bytes)),
-        SqlValue::Real(value) => {
-            let value = value.filter(|x| !x.is_nan()).map(|x| if x == 0.0 { 0.0 } else { x });
-            number(hasher, b'r', value.map(f64::to_le_bytes));
-        }
-        SqlValue::Text(Some(text)) if text.contains('\0') => {
-            add_bytes(hasher, Some(replace_nul(text.clone()).as_bytes()));
-        }
-        SqlValue::Text(text) => add_bytes(hasher, text.as_ref().map(String::as_bytes)),
+        SqlValue::Integer(value) => add_integer(hasher, *value),
+        SqlValue::Real(value) => add_real(hasher, *value),
+        SqlValue::Text(text) => add_text(hasher, text.as_deref()),
         SqlValue::Bytes(bytes) => add_bytes(hasher, bytes.as_deref()),
+    }
+}
+
+/// The same for the value of a column, in place.
+fn add_column(hasher: &mut Hasher, row: &SqlRow, kind: ColumnType, index: impl Index) -> Result<()> {
+    match kind {
+        ColumnType::Integer => add_integer(hasher, row.get(index)?),
+        ColumnType::Real => add_real(hasher, row.get(index)?),
+        ColumnType::Text => add_text(hasher, row.text(index)?),
+        ColumnType::Bytes => add_bytes(hasher, row.bytes(index)?),
+    }
+    Ok(())
+}
+
+fn add_integer(hasher: &mut Hasher, value: Option<i64>) {
+    add_number(hasher, b'i', value.map(i64::to_le_bytes));
+}
+
+/// Databases drop the sign of zero.
+fn add_real(hasher: &mut Hasher, value: Option<f64>) {
+    let value = value.filter(|x| !x.is_nan()).map(|x| if x == 0.0 { 0.0 } else { x });
+    add_number(hasher, b'r', value.map(f64::to_le_bytes));
+}
+
+fn add_number(hasher: &mut Hasher, kind: u8, bits: Option<[u8; 8]>) {
+    let mut bytes = [0; 10];
+    bytes[..2].copy_from_slice(&[kind, u8::from(bits.is_some())]);
+    bytes[2..].copy_from_slice(&bits.unwrap_or_default());
+    hasher.update(&bytes);
+}
+
+/// Databases drop NUL bytes in text.
+fn add_text(hasher: &mut Hasher, text: Option<&str>) {
+    match text {
+        Some(text) if text.contains('\0') => {
+            add_bytes(hasher, Some(replace_nul(text.to_owned()).as_bytes()));
+        }
+        text => add_bytes(hasher, text.map(str::as_bytes)),
     }
 }
 
@@ -440,10 +479,11 @@ mod tests {
         ] {
             let words = |one: &str| one.split_whitespace().collect::<Vec<_>>().join(" ");
             let selected: Vec<_> = selected.split(',').map(words).collect();
-            for column in table.columns.iter().chain([&table.key, &table.checksum]) {
-                let wanted = format!("{}.{} AS {}", table.name, column.name, column.joined);
-                assert!(selected.contains(&wanted), "{wanted}");
-            }
+            let wanted = |column: &RowColumn| format!("{}.{} AS {}", table.name, column.name, column.joined);
+            assert!(selected.contains(&wanted(&table.key)), "{}", table.name);
+            // In the order of the checksum, which follows.
+            let columns: Vec<_> = table.columns.iter().chain([&table.checksum]).map(wanted).collect();
+            assert!(selected.ends_with(&columns), "{columns:?}");
         }
     }
 }

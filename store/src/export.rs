@@ -85,35 +85,3 @@ pub enum ExportSource {
         frame: u64,
     },
 }
-
-/// A label with a candidate of its structure. A structure that several walks found comes once with each of its candidates.
-#[derive(Clone, Debug)]
-pub struct LabelArrival {
-    /// Number of the label; labels have ascending numbers as they are stored.
-    pub number: i64,
-    /// Sequence number of the candidate's decision.
-    pub decision: i64,
-    /// The labelled candidate.
-    pub row: ExportRow,
-}
-
-/// A sum over rows of labels, by which a reader notices that what it has read has changed since.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ArrivalSum {
-    /// Number of rows.
-    pub(crate) rows: u64,
-    /// Sum of x³ mod p over the rows, where x = 48271 label + 69621 decision mod p.
-    pub(crate) sum: i64,
-}
-
-impl ArrivalSum {
-    /// p = 2³¹ − 1.
-    const MODULUS: i64 = 2_147_483_647;
-
-    /// Adds a row.
-    pub fn add(&mut self, arrival: &LabelArrival) {
-        let x = (48_271 * arrival.number + 69_621 * arrival.decision) % Self::MODULUS;
-        self.rows += 1;
-        self.sum += x * x % Self::MODULUS * x % Self::MODULUS;
-    }
-}

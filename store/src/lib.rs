@@ -22,6 +22,7 @@ mod filesystem;
 mod history;
 mod jobs;
 mod label_values;
+mod labelled;
 mod listing;
 mod location;
 mod lock;
@@ -56,7 +57,7 @@ pub use candidate_history::{
 pub use check::Finding;
 pub use error::{Result, StoreError};
 pub use exclude::{ExcludedLabel, Exclusion, ExclusionChange};
-pub use export::{ArrivalSum, ExportCursor, ExportFilter, ExportRow, ExportSource, LabelArrival, LabelMark};
+pub use export::{ExportCursor, ExportFilter, ExportRow, ExportSource, LabelMark};
 pub use file_names::{DATABASE, LOCK};
 pub use filesystem::{check_directory, free_space, network_file_system};
 pub use history::HistorySample;
@@ -66,14 +67,14 @@ pub use jobs::{
     QueuedImports, Supersession,
 };
 pub use label_values::{FinishedStructure, LabelValue, QueuedStructure};
-pub use listing::{ListCursor, ListOrder, ListedCandidate, NO_LABEL_VALUE};
+pub use labelled::{ArrivalSum, FailedCandidate, LabelArrival, LabelledCandidate};
+pub use listing::{ListCursor, ListLimits, ListOrder, ListedCandidate, NO_LABEL_VALUE};
 pub use location::{Location, ServerUrl};
 pub use lock::CampaignLock;
 pub use lower_states::{LowerState, LowerStateChange, LowerStateRule, OnLowerState, StateResult};
 pub use numbers::NumbersError;
 pub use outcomes::{
-    FailureCount, FinishedCandidate, LabelCost, LabelUsage, LabelledEnergies, NearDuplicate, PendingJobs,
-    Unlabelled, ValueRange,
+    FailureCount, LabelCost, LabelUsage, LabelledEnergies, NearDuplicate, PendingJobs, Unlabelled, ValueRange,
 };
 pub use postgres::server::SERVER_RECONNECT_TIMEOUT;
 pub use process_start::{is_local, is_running, process_start_time};

@@ -27,6 +27,15 @@ pub struct ListCursor {
     pub decision: i64,
 }
 
+/// Least and largest values of candidates that a page has; `None` without a limit, and with one the value is there.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ListLimits {
+    /// Largest γ under the original mixture.
+    pub gamma: [Option<f64>; 2],
+    /// V/V₀.
+    pub relative_volume: [Option<f64>; 2],
+}
+
 /// A row of the table.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ListedCandidate {

@@ -2,9 +2,6 @@
 
 use atoms::Species;
 use serde::Serialize;
-use wire::{ContentHash, Origin};
-
-use crate::records::AtomGrades;
 
 /// The cost of a label made in this campaign.
 #[derive(Clone, Debug, PartialEq)]
@@ -101,40 +98,6 @@ pub struct Unlabelled {
     pub relative_volume: ValueRange,
     /// The same for the labelled ones.
     pub relative_volume_labelled: ValueRange,
-}
-
-/// A candidate whose job is finished. Identical structures share a job, such as the first steps of a walk and of
-/// its control.
-#[derive(Clone, Debug, PartialEq)]
-pub struct FinishedCandidate {
-    /// Sequence number of the decision on it; the next page starts after it.
-    pub decision: i64,
-    /// Name of the candidate.
-    pub candidate: String,
-    /// Number of its walk.
-    pub walk: u32,
-    /// Step of its walk.
-    pub step: u64,
-    /// Hash of its structure.
-    pub content: ContentHash,
-    /// Whether it has a label; otherwise all attempts failed.
-    pub labelled: bool,
-    /// Biased or control.
-    pub origin: Origin,
-    /// Name of the seed structure.
-    pub seed_structure: String,
-    /// Formula.
-    pub formula: String,
-    /// Largest γ under the original mixture.
-    pub gamma: Option<f64>,
-    /// Largest γ_nbr under the original mixture.
-    pub gamma_nbr: Option<f64>,
-    /// V/V₀.
-    pub relative_volume: Option<f64>,
-    /// Failure class of the last attempt, if labelling failed.
-    pub class: Option<String>,
-    /// γ and γ_nbr of its atoms under the original mixture, if labelling failed.
-    pub unlabelled: Option<AtomGrades>,
 }
 
 /// A labelled structure that may nearly duplicate another.

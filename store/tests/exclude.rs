@@ -87,7 +87,7 @@ async fn an_excluded_label_counts_nowhere_until_it_is_included_again() {
     assert_eq!(exported(&store, &dft).await, [-1.0, -3.0]);
     let energies = store.labelled_energies(dft.hash, 0, 100).await.unwrap();
     assert_eq!(energies.iter().map(|e| (e.model, e.label)).collect::<Vec<_>>(), [(-8.5, -1.0), (-8.5, -3.0)]);
-    assert_eq!(store.finished(dft.hash, 0, 9).await.unwrap().len(), 2);
+    assert_eq!(store.labelled_after(dft.hash, 0, 9).await.unwrap().len(), 2);
     let collected = store.collected(Some(dft.hash), 0, 9).await.unwrap();
     let forces: Vec<_> = collected.iter().map(|row| row.label_forces.is_some()).collect();
     assert_eq!(forces, [true, false, true]);

@@ -1,8 +1,12 @@
-//! Pages of the candidates of one walk.
+//! Pages of the candidates of one walk, and of those with one state of their label job.
 
-use store::{Fate, ListedCandidate, Store};
-use wire::Origin;
+use serde_json::json;
+use store::{
+    CandidateRecord, Fate, JobState, ListCursor, ListLimits, ListOrder, ListedCandidate, NewProtocol,
+    RelabelRequest, Store,
+};
 use wire::messages::DeclineReason;
+use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 
 use crate::common::*;
 
@@ -45,4 +49,143 @@ async fn candidates_of_a_walk_come_in_decision_order() {
         fates,
         [(1000, "accepted", Some("queued")), (200, "covered", None), (90, "accepted", Some("queued"))]
     );
+}
+
+/// The same structure, found by the control walk 9.
+fn found_again(found: &CandidateRecord) -> CandidateRecord {
+    let first = found.block.view().to_candidate();
+    let id = CandidateId { walk: WalkId(9), ..first.id };
+    let block = CandidateBlock::encode(&Candidate { id, origin: Origin::Control, ..first });
+    CandidateRecord { block, priority: 0, ..found.clone() }
+}
+
+/// Label jobs in all states. Every second structure has two candidates, some have jobs of two protocols, and some grades are equal.
+async fn in_all_states(store: &Store) {
+    let mut names = Vec::new();
+    for step in 1..=16 {
+        let mut found = candidate(0, step, Origin::Biased, Fate::Accepted);
+        found.original.gamma[0] = 1.0 + 0.1 * (7 * step % 5) as f64;
+        names.push(name_of(&found));
+        let declined = candidate(1, step, Origin::Biased, Fate::Declined(DeclineReason::Covered));
+        let again = (step % 2 == 0).then(|| found_again(&found));
+        let records = [found, declined].into_iter().chain(again).collect();
+        store.commit(&commit_of(records)).await.unwrap();
+    }
+    for step in 1..=4 {
+        let lease = store.lease(protocol("dft").hash, "host/a", 0, 10).await.unwrap().unwrap();
+        store.complete(&lease, &label(-f64::from(step)), 1).await.unwrap();
+    }
+    let again = [1, 2].map(|step| ContentHash::from_structure(&structure(1e-6 * f64::from(step))));
+    let (fine, changes) = (protocol("fine"), [json!({ "key": "label.protocol" })]);
+    let new = NewProtocol { protocol: &fine, configuration: "{}", changes: &changes, notes: &[] };
+    let order =
+        RelabelRequest { structures: &again, include_current: false, reason: "cutoff", protocol: Some(new) };
+    store.relabel(&order, 2).await.unwrap();
+    for attempt in 0..8 {
+        let lease = store.lease(fine.hash, "host/a", 3, 10).await.unwrap().unwrap();
+        match attempt {
+            0..3 => drop(store.complete(&lease, &label(-9.0), 4).await.unwrap()),
+            3..6 => drop(store.fail(&lease, "timeout", "", 1, 4).await.unwrap()),
+            _ => {}
+        }
+    }
+    for name in &names[12..14] {
+        store.drop_job(name, 5).await.unwrap();
+    }
+}
+
+/// Decisions on the candidates of a state, read in pages of `limit`.
+async fn of_state(
+    store: &Store,
+    state: JobState,
+    origin: Option<&str>,
+    order: (ListOrder, bool),
+    limit: u32,
+) -> Vec<i64> {
+    let (mut found, mut after) = (Vec::new(), None);
+    loop {
+        let page = store.list_state(state, origin, order, after, limit).await.unwrap();
+        let Some(last) = page.last() else { return found };
+        let value = match order.0 {
+            ListOrder::Decision => None,
+            ListOrder::Gamma => last.gamma,
+            ListOrder::Volume => last.relative_volume,
+        };
+        after = Some(ListCursor { priority: 0, value: value.unwrap_or_default(), decision: last.decision });
+        found.extend(page.iter().map(|row| row.decision));
+    }
+}
+
+#[tokio::test]
+async fn candidates_of_a_state_are_those_of_all_with_that_state() {
+    let database = TestDatabase::new();
+    let store = database.create().await.with_caller_clock();
+    in_all_states(&store).await;
+    let mut numbers = Vec::new();
+    for order in [ListOrder::Decision, ListOrder::Gamma, ListOrder::Volume] {
+        for order in [(order, true), (order, false)] {
+            let all = store.list_candidates(order.0, order.1, None, 99).await.unwrap();
+            for (state, origin) in
+                JobState::ALL.into_iter().flat_map(|state| [None, Some("control")].map(|one| (state, one)))
+            {
+                let has = |row: &&ListedCandidate| {
+                    row.job_state.as_deref() == Some(state.name())
+                        && origin.is_none_or(|wanted| row.origin == wanted)
+                };
+                let expected: Vec<_> = all.iter().filter(has).map(|row| row.decision).collect();
+                for limit in [1, 3, 99] {
+                    let found = of_state(&store, state, origin, order, limit).await;
+                    assert_eq!(found, expected, "{state:?} {origin:?} {order:?} by {limit}");
+                }
+                numbers.push(expected.len());
+            }
+        }
+    }
+    // Queued, leased, labelled, failed, dropped, superseded; each of both origins, then of control walks.
+    assert_eq!(numbers[..12], [6, 2, 3, 1, 7, 2, 5, 2, 3, 1, 0, 0]);
+    assert!(store.has_more_jobs(JobState::Failed, 2).await.unwrap());
+    assert!(!store.has_more_jobs(JobState::Failed, 3).await.unwrap());
+}
+
+#[tokio::test]
+async fn candidates_within_limits_are_those_of_all_within_them() {
+    let database = TestDatabase::new();
+    let store = database.create().await.with_caller_clock();
+    in_all_states(&store).await;
+    let mut numbers = Vec::new();
+    for (gamma, relative_volume) in [
+        ([Some(1.2), None], [None; 2]),
+        ([None, Some(1.2)], [None; 2]),
+        ([Some(1.1), Some(1.3)], [Some(1.01), None]),
+        ([None; 2], [None, Some(1.0)]),
+    ] {
+        let is_within = |value: Option<f64>, [low, high]: [Option<f64>; 2]| {
+            value.is_some_and(|value| {
+                low.is_none_or(|low| value >= low) && high.is_none_or(|high| value <= high)
+            })
+        };
+        for (fate, descending) in [None, Some(("control", None)), Some(("biased", Some("covered")))]
+            .into_iter()
+            .flat_map(|fate| [(fate, true), (fate, false)])
+        {
+            let all = store.list_candidates(ListOrder::Decision, descending, None, 99).await.unwrap();
+            assert_eq!(store.newest_candidate().await.unwrap(), all.len() as i64);
+            let has = |row: &&ListedCandidate| {
+                (5..30).contains(&row.decision)
+                    && is_within(row.gamma, gamma)
+                    && is_within(row.relative_volume, relative_volume)
+                    && fate.is_none_or(|(origin, reason)| {
+                        row.origin == origin && row.fate == reason.unwrap_or("accepted")
+                    })
+            };
+            let expected: Vec<_> = all.iter().filter(has).map(|row| row.decision).take(6).collect();
+            let limits = ListLimits { gamma, relative_volume };
+            let found = store.list_within(5..30, limits, fate, descending, 6).await.unwrap();
+            let found: Vec<_> = found.iter().map(|row| row.decision).collect();
+            assert_eq!(found, expected, "{limits:?} {fate:?} {descending}");
+            numbers.push(found.len());
+        }
+    }
+    assert!(numbers[..18].iter().filter(|number| **number > 0).count() > 12, "{numbers:?}");
+    assert!(numbers[18..].iter().all(|number| *number == 0), "{numbers:?}");
 }

@@ -1,8 +1,8 @@
 //! Results of label jobs, as the cost model, `status` and the table of force errors read them.
 
 use store::{
-    ArrivalSum, Commit, ExportFilter, FailureCount, Fate, FateCount, JobState, LabelUsage, Lease,
-    PendingJobs, RelabelRequest, Store, Unlabelled, ValueRange, WalkRecord,
+    ArrivalSum, Commit, ExportFilter, FailedCandidate, FailureCount, Fate, FateCount, JobState, LabelUsage,
+    LabelledCandidate, Lease, PendingJobs, RelabelRequest, Store, Unlabelled, ValueRange, WalkRecord,
 };
 use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
@@ -145,9 +145,9 @@ async fn labels_are_read_in_the_order_in_which_they_came() {
         assert_eq!(store.label_arrivals_until(dft, after).await.unwrap(), sum, "of what was read");
         let page = store.label_arrivals(dft, after, 1).await.unwrap();
         let Some(arrival) = page.first() else { break };
-        after = Some((arrival.number, arrival.decision));
+        after = Some((arrival.number, arrival.candidate.decision));
         sum.add(arrival);
-        found.push((arrival.row.label.energy, arrival.decision));
+        found.push((arrival.candidate.label.energy, arrival.candidate.decision));
     }
     assert_eq!(found, [(-3.0, 3), (-2.0, 2), (-2.0, 4), (-1.0, 1)]);
     assert_eq!(store.label_arrivals(dft, None, 10).await.unwrap().len(), 4);
@@ -194,31 +194,51 @@ async fn failed_labels_are_grouped_by_seed_structure_and_formula() {
     }
 
     // In pages of any length.
-    let (mut after, mut jobs) = (0, Vec::new());
+    let (dft, mut failed, mut labelled) = (protocol("dft").hash, Vec::new(), Vec::new());
     loop {
-        let page = store.finished(protocol("dft").hash, after, 2).await.unwrap();
-        let Some(last) = page.last() else { break };
-        after = last.decision;
-        jobs.extend(page);
+        let after = failed.last().map_or(0, |last: &FailedCandidate| last.decision);
+        let page = store.failed_after(dft, after, 1).await.unwrap();
+        if page.is_empty() {
+            break;
+        }
+        failed.extend(page);
     }
-    let seen: Vec<_> = jobs.iter().map(|job| (job.candidate.as_str(), job.labelled, job.gamma)).collect();
-    let expected = [1.5, 1.6, 1.7, 4.0, 3.0];
-    assert_eq!(seen.len(), 5, "{seen:?}");
-    for (k, (name, labelled, gamma)) in seen.into_iter().enumerate() {
-        assert_eq!((name, labelled, gamma), (names[k].as_str(), k < 3, Some(expected[k])));
+    loop {
+        let after = labelled.last().map_or(0, |last: &LabelledCandidate| last.decision);
+        let page = store.labelled_after(dft, after, 2).await.unwrap();
+        if page.is_empty() {
+            break;
+        }
+        labelled.extend(page);
     }
-    assert_eq!((jobs[0].class.as_deref(), jobs[3].class.as_deref()), (None, Some("crashed")));
-    assert!(jobs[1].unlabelled.is_none());
-    for job in &jobs {
+    let seen: Vec<_> = failed.iter().map(|one| (one.candidate.as_str(), one.gamma)).collect();
+    assert_eq!(seen, [(names[3].as_str(), Some(4.0)), (names[4].as_str(), Some(3.0))]);
+    for one in &failed {
         // campaign-walk.segment.step-content
-        let place = format!("-{}.0.{}-", job.walk, job.step);
-        assert!(job.candidate.contains(&place), "{} {place}", job.candidate);
-        assert!(job.content.to_string().starts_with(job.candidate.rsplit('-').next().unwrap()));
+        let place = format!("-{}.0.{}-", one.walk, one.step);
+        assert!(one.candidate.contains(&place), "{} {place}", one.candidate);
+        assert!(one.content.to_string().starts_with(one.candidate.rsplit('-').next().unwrap()));
     }
-    assert_eq!(jobs[3].unlabelled.as_ref().unwrap().gamma, [4.0, 0.8]);
+    assert_eq!((&failed[0].original.gamma[..], failed[0].relative_volume), (&[4.0, 0.8][..], Some(1.4)));
+    let seen: Vec<_> =
+        labelled.iter().map(|one| (one.block.view().id().to_string(), one.gamma, one.label.energy)).collect();
+    let expected = [(1.5, -1.0), (1.6, -2.0), (1.7, -3.0)];
+    let expected =
+        names.iter().zip(expected).map(|(name, (gamma, energy))| (name.clone(), Some(gamma), energy));
+    assert_eq!(seen, expected.collect::<Vec<_>>());
+    assert!(
+        labelled
+            .iter()
+            .all(|one| one.job == Some(JobState::Labelled) && one.structure == one.block.view().structure())
+    );
+    let decisions = [5, 3, 1].map(|place| labelled[0].decision + place - 1);
+    let listed = store.labelled_of_decisions(dft, &decisions).await.unwrap();
+    let listed: Vec<_> = listed.iter().map(|one| one.label.energy).collect();
+    assert_eq!(listed, [-1.0, -3.0], "those with a label");
     // A protocol without jobs has no results.
     store.add_protocol(&protocol("other"), 0).await.unwrap();
-    assert!(store.finished(protocol("other").hash, 0, 9).await.unwrap().is_empty());
+    assert!(store.failed_after(protocol("other").hash, 0, 9).await.unwrap().is_empty());
+    assert!(store.labelled_after(protocol("other").hash, 0, 9).await.unwrap().is_empty());
     assert!(store.unlabelled(protocol("other").hash, 0, true).await.unwrap().is_empty());
     assert!(store.unlabelled(ContentHash([9; 32]), 0, true).await.is_err());
 }
@@ -318,6 +338,7 @@ async fn labels_of_different_versions_are_kept_apart() {
         let energies = store.labelled_energies(dft, version, 9).await.unwrap();
         assert_eq!(energies.iter().map(|found| found.label).collect::<Vec<_>>(), expected);
     }
-    let walks: Vec<_> = store.finished(dft, 0, 9).await.unwrap().iter().map(|found| found.walk).collect();
+    let labelled = store.labelled_after(dft, 0, 9).await.unwrap();
+    let walks: Vec<_> = labelled.iter().map(|found| found.block.view().id().walk.0).collect();
     assert_eq!(walks, [0, 1]);
 }

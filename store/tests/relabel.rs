@@ -87,7 +87,9 @@ async fn a_doubtful_label_stays_until_the_new_one_arrives() {
     let labels = store.status().await.unwrap().labels;
     assert_eq!((labels.queued, labels.labelled, labels.relabelling, labels.relabel_failed), (2, 0, 1, 0));
     assert_eq!(store.unfinished_jobs().await.unwrap(), 1, "walks did not find it");
-    assert_eq!(store.finished(dft.hash, 0, 9).await.unwrap().len(), 1);
+    let kept: Vec<_> =
+        store.labelled_after(dft.hash, 0, 9).await.unwrap().iter().map(|found| found.job).collect();
+    assert_eq!(kept, [Some(JobState::Queued)]);
     whole(&store).await;
 
     let found = lease(&store, &dft, 300).await.unwrap();

@@ -50,7 +50,7 @@ pub struct ErrorBin {
 }
 
 impl ForceErrors {
-    /// An empty collection. Errors above `threshold`, eV/Å, count as large. Keeps at most `room` atoms, 24
+    /// An empty collection. Errors above `threshold`, eV/Å, count as large. Keeps at most `room` atoms, 17
     /// bytes each.
     pub fn new(bins: Bins, threshold: f64, room: usize) -> Self {
         let counts = vec![Counts::default(); bins.count()];

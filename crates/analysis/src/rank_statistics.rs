@@ -42,13 +42,14 @@ pub fn roc_auc(grades: &[f64], errors: &[f64], threshold: f64) -> Option<f64> {
 
 /// Rank of each value, from 1; ties share their mean rank.
 fn average_ranks(values: &[f64]) -> Vec<f64> {
-    let mut order: Vec<_> = (0..values.len()).collect();
-    order.sort_by(|i, j| values[*i].total_cmp(&values[*j]));
+    let value = |i: &u32| values[*i as usize];
+    let mut order: Vec<_> = (0..values.len() as u32).collect();
+    order.sort_by(|i, j| value(i).total_cmp(&value(j)));
     let mut ranks = vec![0.0; values.len()];
     let mut before = 0;
-    for run in order.chunk_by(|i, j| values[*i] == values[*j]) {
+    for run in order.chunk_by(|i, j| value(i) == value(j)) {
         let rank = before as f64 + 0.5 * (run.len() + 1) as f64;
-        run.iter().for_each(|i| ranks[*i] = rank);
+        run.iter().for_each(|i| ranks[*i as usize] = rank);
         before += run.len();
     }
     ranks

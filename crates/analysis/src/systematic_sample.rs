@@ -6,17 +6,19 @@ use crate::random::mixed;
 /// so on. The choice depends only on the index in the stream, so parallel streams keep the same indices.
 #[derive(Clone, Debug)]
 pub struct SystematicSample<T> {
-    kept: Vec<(u32, T)>,
+    kept: Vec<T>,
+    /// The level of the index of each, at most 64.
+    levels: Vec<u8>,
     room: usize,
     /// An item is kept if the level of its index is at least this.
-    least: u32,
+    least: u8,
     seen: u64,
 }
 
 impl<T> SystematicSample<T> {
     /// A sample of at most `room` items (at least one).
     pub fn new(room: usize) -> Self {
-        Self { kept: Vec::new(), room: room.max(1), least: 0, seen: 0 }
+        Self { kept: Vec::new(), levels: Vec::new(), room: room.max(1), least: 0, seen: 0 }
     }
 
     /// Offers the next item.
@@ -26,21 +28,28 @@ impl<T> SystematicSample<T> {
 
     /// Offers the next item, which is made only if it is kept.
     pub fn add_with(&mut self, item: impl FnOnce() -> T) {
-        let level = mixed(self.seen).trailing_zeros();
+        let level = mixed(self.seen).trailing_zeros() as u8;
         self.seen += 1;
-        if level < self.least {
-            return;
+        while level >= self.least {
+            if self.kept.len() < self.room {
+                self.kept.push(item());
+                return self.levels.push(level);
+            }
+            self.halve();
         }
-        self.kept.push((level, item()));
-        while self.kept.len() > self.room {
-            self.least += 1;
-            self.kept.retain(|(level, _)| *level >= self.least);
-        }
+    }
+
+    /// Drops the items of the least level.
+    fn halve(&mut self) {
+        self.least += 1;
+        let mut stays = self.levels.iter().map(|level| *level >= self.least);
+        self.kept.retain(|_| stays.next() == Some(true));
+        self.levels.retain(|level| *level >= self.least);
     }
 
     /// The sampled items, in order.
     pub fn items(&self) -> impl ExactSizeIterator<Item = &T> {
-        self.kept.iter().map(|(_, item)| item)
+        self.kept.iter()
     }
 
     /// Number of items offered.

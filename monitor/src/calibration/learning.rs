@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use analysis::GradedError;
 use atoms::cell::{norm, sub};
-use store::{ExportSource, LabelArrival, Store, StoreError, WalkVersions};
+use store::{LabelArrival, LabelledCandidate, Store, StoreError, WalkVersions};
 use wire::ContentHash;
 
 use super::CalibrationState;
@@ -47,39 +47,34 @@ impl<'a> ArrivedLabels<'a> {
             let Some(arrival) = self.page.pop_front() else {
                 self.page = self.store.label_arrivals(self.protocol, self.after, PAGE_ROWS).await?.into();
                 let Some(last) = self.page.back() else { return Ok(None) };
-                self.after = Some((last.number, last.decision));
+                self.after = Some((last.number, last.candidate.decision));
                 continue;
             };
-            if arrival.number == self.last || version_of(&arrival, &self.versions) != Some(self.version) {
-                continue;
-            }
-            if let Some(found) = labelled_structure(&arrival) {
+            if arrival.number != self.last && version_of(&arrival, &self.versions) == self.version {
                 self.last = arrival.number;
-                return Ok(Some(found));
+                return Ok(Some(labelled_structure(&arrival.candidate)));
             }
         }
     }
 }
 
-/// The version of the potential of the walk that found a structure; `None` for an imported one.
-pub(super) fn version_of(arrival: &LabelArrival, versions: &WalkVersions) -> Option<u32> {
-    let ExportSource::Candidate { block, .. } = &arrival.row.source else { return None };
-    Some(versions.version_of(block.view().id().walk.0))
+/// The version of the potential of the walk that found a structure.
+pub(super) fn version_of(arrival: &LabelArrival, versions: &WalkVersions) -> u32 {
+    versions.version_of(arrival.candidate.block.view().id().walk.0)
 }
 
-/// What is learned from a structure; `None` for an imported one, which has no grades.
-pub(super) fn labelled_structure(arrival: &LabelArrival) -> Option<ArrivedLabel> {
-    let ExportSource::Candidate { block, original, .. } = &arrival.row.source else { return None };
+/// What is learned from a structure.
+pub(super) fn labelled_structure(candidate: &LabelledCandidate) -> ArrivedLabel {
+    let LabelledCandidate { structure, block, original, label, .. } = candidate;
     let view = block.view();
-    let label = &arrival.row.label;
     let errors = view.forces.iter().zip(&label.forces).map(|(model, label)| norm(sub(*model, *label)));
-    let species = arrival.row.structure.species.iter().map(|species| species.symbol());
+    let species = structure.species.iter().map(|species| species.symbol());
     let atoms = original.gamma_nbr.iter().zip(errors).zip(species);
-    Some(ArrivedLabel {
+    ArrivedLabel {
         content: view.id().content,
         ordered_by_value: label.details.ordered_by_value,
         atoms: atoms.map(|((grade, error), group)| GradedError { grade: *grade, error, group }).collect(),
-    })
+    }
 }
 
 impl CalibrationState {

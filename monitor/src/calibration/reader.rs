@@ -8,14 +8,14 @@ use std::collections::BTreeMap;
 use store::{ArrivalSum, LabelArrival, Store, StoreError, WalkVersions};
 use wire::ContentHash;
 
-use super::CalibrationState;
 use super::learning::{PAGE_ROWS, labelled_structure, version_of};
+use super::{CalibrationState, CalibrationSummary};
 
 /// Keeps the calibrations of all versions of the potential, so that each reading costs what is new.
 ///
 /// A calibration depends on the order of its labels. Each reading therefore first compares a sum over the labels that it knows
 /// ([`ArrivalSum`]) with that of the database, and reads all again if they differ.
-#[derive(Default)]
+#[derive(Debug, Default)]
 pub struct CalibrationReader {
     protocol: Option<ContentHash>,
     /// Label and decision of the last row that was read.
@@ -25,6 +25,7 @@ pub struct CalibrationReader {
     versions: BTreeMap<u32, LearnedVersion>,
 }
 
+#[derive(Debug)]
 struct LearnedVersion {
     state: CalibrationState,
     /// The last label that it learned from.
@@ -38,14 +39,16 @@ impl CalibrationReader {
         if self.protocol != Some(protocol) || self.sum != known {
             *self = Self { protocol: Some(protocol), ..Self::default() };
         }
+        // The walks of these labels are in the store. Later ones are read the next time.
+        let newest = store.newest_label().await?;
+        let versions = store.walk_versions().await?;
         let mut read = 0;
         loop {
-            let page = store.label_arrivals(protocol, self.after, PAGE_ROWS).await?;
+            let mut page = store.label_arrivals(protocol, self.after, PAGE_ROWS).await?;
+            page.retain(|arrival| arrival.number <= newest);
             let Some(last) = page.last() else { return Ok(read) };
-            // After the labels: a walk is in the store before its labels are.
-            let versions = store.walk_versions().await?;
             page.iter().for_each(|arrival| self.learn(arrival, &versions));
-            self.after = Some((last.number, last.decision));
+            self.after = Some((last.number, last.candidate.decision));
             read += page.len() as u64;
         }
     }
@@ -55,17 +58,21 @@ impl CalibrationReader {
         self.versions.get(&version).map(|learned| &learned.state)
     }
 
+    /// What the bounds of a version are, also before its first label.
+    pub fn summary(&self, version: u32) -> CalibrationSummary {
+        self.of_version(version)
+            .map_or_else(|| CalibrationState::new(version).summary(), CalibrationState::summary)
+    }
+
     /// Learns from a structure, once for each version whose walks found it.
     fn learn(&mut self, arrival: &LabelArrival, versions: &WalkVersions) {
         self.sum.add(arrival);
-        let Some(version) = version_of(arrival, versions) else { return };
+        let version = version_of(arrival, versions);
         let empty = || LearnedVersion { state: CalibrationState::new(version), last: 0 };
         let learned = self.versions.entry(version).or_insert_with(empty);
-        if learned.last != arrival.number
-            && let Some(labelled) = labelled_structure(arrival)
-        {
+        if learned.last != arrival.number {
             learned.last = arrival.number;
-            learned.state.learn(&labelled);
+            learned.state.learn(&labelled_structure(&arrival.candidate));
         }
     }
 }

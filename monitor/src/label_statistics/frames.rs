@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use analysis::{GroupSample, SystematicSample};
 use atoms::cell::{norm, sub};
 use atoms::{Matrix3, Species, Structure, Vec3};
-use store::{ExportRow, ExportSource, FinishedCandidate};
+use store::{FailedCandidate, LabelledCandidate};
 use wire::{ContentHash, Origin};
 
 /// Largest number of labelled, and of failed, structures that are kept, 150 bytes each. Beyond it, a sample of whole walks is kept, the
@@ -109,17 +109,16 @@ impl ComparedFrames {
 
     /// Adds a labelled candidate with the error of its energy per atom, eV. `is_shared`: walks of both origins found it. Its atoms
     /// are then those of the biased walk. Atoms without finite grades and error are left out.
-    pub fn add(&mut self, row: &ExportRow, is_shared: bool, energy_error: Option<f64>) {
-        let ExportSource::Candidate { seed_structure, origin, block, original, .. } = &row.source else {
-            return;
-        };
+    pub fn add(&mut self, row: &LabelledCandidate, is_shared: bool, energy_error: Option<f64>) {
+        let LabelledCandidate { seed_structure, block, original, .. } = row;
         let view = block.view();
+        let origin = view.origin();
         let id = view.id();
         let walk = self.biased_walk(id.walk.0);
-        let place = FramePlace { seed_structure: *seed_structure, walk, origin: *origin };
+        let place = FramePlace { seed_structure: *seed_structure, walk, origin };
         let differences = view.forces.iter().zip(&row.label.forces);
         let differences: Vec<Vec3> = differences.map(|(model, label)| sub(*model, *label)).collect();
-        if !(is_shared && *origin == Origin::Control) {
+        if !(is_shared && origin == Origin::Control) {
             let grades = original.gamma.iter().zip(&original.gamma_nbr);
             for ((species, (gamma, gamma_nbr)), difference) in
                 row.structure.species.iter().zip(grades).zip(&differences)
@@ -158,8 +157,8 @@ impl ComparedFrames {
     }
 
     /// Adds a candidate whose label failed. `is_shared`: walks of both origins found it.
-    pub fn add_failed(&mut self, candidate: &FinishedCandidate, is_shared: bool) {
-        let FinishedCandidate { origin, walk, step, content, .. } = candidate;
+    pub fn add_failed(&mut self, candidate: &FailedCandidate, is_shared: bool) {
+        let FailedCandidate { origin, walk, step, content, .. } = candidate;
         let walk = self.biased_walk(*walk);
         self.add_failed_frame(FailedFrame {
             origin: *origin,

@@ -14,8 +14,7 @@ use analysis::{Bins, Completion, ForceErrors};
 use atoms::cell::{norm, sub};
 use serde_json::Value;
 use store::{
-    AtomGrades, ExportFilter, ExportRow, ExportSource, FinishedCandidate, JobState, Protocol, Store,
-    StoreError, WalkVersions,
+    AtomGrades, FailedCandidate, JobState, LabelledCandidate, Protocol, Store, StoreError, WalkVersions,
 };
 use wire::{ContentHash, Origin};
 
@@ -102,21 +101,20 @@ pub async fn read(
     };
     statistics.compared.unfinished = unfinished(store, protocol).await?;
     let shared = store.structures_of_both_origins().await?;
-    let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
-    let mut after = None;
+    let mut after = 0;
     loop {
-        let page = store.labelled(&filter, after, PAGE_ROWS).await?;
+        let page = store.labelled_after(protocol, after, PAGE_ROWS).await?;
         let Some(last) = page.last() else { break };
-        after = Some(last.cursor);
+        after = last.decision;
         page.iter().for_each(|row| statistics.labelled(row, (&versions, version), &shared));
     }
     let mut after = 0;
     loop {
-        let page = store.finished(protocol, after, PAGE_ROWS).await?;
+        let page = store.failed_after(protocol, after, PAGE_ROWS).await?;
         let Some(last) = page.last() else { break };
         after = last.decision;
         let own = page.iter().filter(|candidate| versions.version_of(candidate.walk) == version);
-        own.for_each(|candidate| statistics.finished(candidate, &shared));
+        own.for_each(|candidate| statistics.failed(candidate, &shared));
     }
     Ok(statistics)
 }
@@ -150,23 +148,24 @@ impl LabelStatistics {
     /// Adds a labelled structure if its walk had `version`. `shared`: structures that walks of both origins found.
     fn labelled(
         &mut self,
-        row: &ExportRow,
+        row: &LabelledCandidate,
         (versions, version): (&WalkVersions, u32),
         shared: &HashSet<ContentHash>,
     ) {
-        let ExportSource::Candidate { origin, block, original, .. } = &row.source else { return };
+        let LabelledCandidate { block, original, label, .. } = row;
         let view = block.view();
-        let errors = view.forces.iter().zip(&row.label.forces);
-        let errors: Vec<_> = errors.map(|(model, label)| norm(sub(*model, *label))).collect();
+        let origin = view.origin();
         let (of, is_shared) = (versions.version_of(view.id().walk.0), shared.contains(&view.id().content));
-        let error = self.energies.error_per_atom(&row.structure, view.energy(), row.label.energy);
+        let error = self.energies.error_per_atom(&row.structure, view.energy(), label.energy);
         if of == version {
             self.compared.add(row, is_shared, error);
         }
-        if is_shared && *origin == Origin::Control {
+        if is_shared && origin == Origin::Control {
             // Counted with the biased walk.
             return;
         }
+        let errors = view.forces.iter().zip(&label.forces);
+        let errors: Vec<_> = errors.map(|(model, label)| norm(sub(*model, *label))).collect();
         if !versions.is_single() {
             self.of_version(of).labelled(original, &errors);
         }
@@ -174,42 +173,38 @@ impl LabelStatistics {
             return;
         }
         match is_shared {
-            false => self.for_origin(*origin, |grades| grades.labelled(original, &errors)),
+            false => self.for_origin(origin, |grades| grades.labelled(original, &errors)),
             true => {
                 self.shared += 1;
                 self.all.labelled(original, &errors);
             }
         }
-        self.energies.add(&row.structure, view.energy(), row.label.energy);
+        self.energies.add(error);
         self.parity.add(row, error);
+        // A job with a label may have failed to make another one.
+        if matches!(row.job, Some(JobState::Labelled | JobState::Queued | JobState::Leased)) {
+            self.by_gamma.add_labelled(row.gamma);
+            self.by_expansion.add_labelled(row.relative_volume);
+        }
     }
 
     fn of_version(&mut self, version: u32) -> &mut ErrorsByGrade {
         self.by_version.entry(version).or_insert_with(|| ErrorsByGrade::new(MAX_SAMPLES_OF_VERSION))
     }
 
-    /// Adds a candidate whose label job is finished. `shared`: structures that walks of both origins found. Each has one job, and
-    /// counts with the biased walk.
-    fn finished(&mut self, candidate: &FinishedCandidate, shared: &HashSet<ContentHash>) {
+    /// Adds a candidate whose label failed. `shared`: structures that walks of both origins found. Each has one job, and counts
+    /// with the biased walk.
+    fn failed(&mut self, candidate: &FailedCandidate, shared: &HashSet<ContentHash>) {
         let is_shared = shared.contains(&candidate.content);
-        if candidate.unlabelled.is_some() {
-            self.compared.add_failed(candidate, is_shared);
-        }
+        self.compared.add_failed(candidate, is_shared);
         if is_shared && candidate.origin == Origin::Control {
             return;
         }
-        for (completion, value) in
-            [(&mut self.by_gamma, candidate.gamma), (&mut self.by_expansion, candidate.relative_volume)]
-        {
-            match candidate.labelled {
-                true => completion.add_labelled(value),
-                false => completion.add_failed(value, candidate.candidate.clone()),
-            }
-        }
-        match &candidate.unlabelled {
-            Some(grades) if is_shared => self.all.unlabelled(grades),
-            Some(grades) => self.for_origin(candidate.origin, |of| of.unlabelled(grades)),
-            None => {}
+        self.by_gamma.add_failed(candidate.gamma, candidate.candidate.clone());
+        self.by_expansion.add_failed(candidate.relative_volume, candidate.candidate.clone());
+        match is_shared {
+            true => self.all.unlabelled(&candidate.original),
+            false => self.for_origin(candidate.origin, |of| of.unlabelled(&candidate.original)),
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use analysis::SystematicSample;
 use serde::{Serialize, Serializer};
-use store::{ExportRow, ExportSource};
+use store::LabelledCandidate;
 
 use super::frames::stress_components;
 
@@ -58,11 +58,10 @@ impl Parity {
     }
 
     /// Adds a labelled candidate. `energy_error` is E_model − E_label per atom without the offsets, eV; `None` if it is not known.
-    pub fn add(&mut self, row: &ExportRow, energy_error: Option<f64>) {
-        let ExportSource::Candidate { id, origin, block, .. } = &row.source else { return };
-        let view = block.view();
-        let point =
-            |label: f64, model: f64| ParityPoint { label, model, id: id.clone(), origin: origin.name() };
+    pub fn add(&mut self, row: &LabelledCandidate, energy_error: Option<f64>) {
+        let view = row.block.view();
+        let (id, origin) = (view.id(), view.origin().name());
+        let point = |label: f64, model: f64| ParityPoint { label, model, id: id.to_string(), origin };
         if let Some(error) = energy_error {
             let model = view.energy() / row.structure.len() as f64;
             self.energy.add(error, || point(model - error, model));

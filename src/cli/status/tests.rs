@@ -11,6 +11,7 @@ use monitor::label_queue::LabelQueue;
 use monitor::mixture_values::MixtureValues;
 use monitor::provenance::Provenance;
 use monitor::snapshot::FORMAT;
+use monitor::versions::CampaignVersions;
 use orchestrator::batch::{CampaignJob, Role};
 use serde_json::{Value, json};
 use store::records::{STALENESS, TRAINING_FRAMES};
@@ -118,6 +119,63 @@ pub fn large() -> Snapshot {
             budget_hours: Some(100.0),
             time: Some(unix_milliseconds() + 108_360_000),
         },
+    }
+}
+
+/// A campaign in which nothing has begun.
+pub fn empty() -> Snapshot {
+    Snapshot {
+        origin: None,
+        status: CampaignStatus::default(),
+        devices: Vec::new(),
+        mixture: MixtureValues(Default::default()),
+        disk: DiskUse { bytes: 1_000_000, forecast: None },
+        labels: LabelQueue::default(),
+        end_reason: None,
+        check: None,
+        versions: CampaignVersions { all: Vec::new(), refit: None },
+        end: ExpectedEnd::default(),
+        ..large()
+    }
+}
+
+/// A campaign whose run was stopped.
+pub fn stopped() -> Snapshot {
+    let walk = |number, state: &str| WalkStatus {
+        walk: number,
+        seed_structure: "bcc-100".into(),
+        origin: "biased".into(),
+        state: state.into(),
+        step: 2000,
+        gamma_max: Some(1.25),
+        accepted: 3,
+        ..WalkStatus::default()
+    };
+    let walks = vec![walk(0, "running"), walk(1, "waiting"), walk(2, "quota_reached")];
+    let candidates = Candidates { seen: 9, accepted: 9, ..Candidates::default() };
+    let labels = LabelJobCounts { queued: 2, labelled: 7, ..LabelJobCounts::default() };
+    let status =
+        CampaignStatus { walks, candidates, labels, mixture_version: 9, ..CampaignStatus::default() };
+    Snapshot { status, ..empty() }
+}
+
+/// A campaign without a label, whose walk ended early.
+fn failed() -> Snapshot {
+    let walks = vec![WalkStatus {
+        walk: 0,
+        seed_structure: "bcc-100".into(),
+        origin: "biased".into(),
+        state: "diverged".into(),
+        reason: "at step 5: 9000 K is above the allowed 800 K".into(),
+        ..WalkStatus::default()
+    }];
+    let labels = LabelJobCounts { failed: 1, ..LabelJobCounts::default() };
+    let unlabelled = Unlabelled { failed: 1, labelled: 0, ..large().labels.unlabelled.remove(0) };
+    let failures = vec![FailureCount { class: "crashed".into(), labelled: 0, failed: 1, unfinished: 0 }];
+    Snapshot {
+        status: CampaignStatus { walks, labels, finished: true, ..CampaignStatus::default() },
+        labels: LabelQueue { failures, unlabelled: vec![unlabelled], ..LabelQueue::default() },
+        ..empty()
     }
 }
 
@@ -240,6 +298,57 @@ fn the_status_of_a_large_campaign_fits_a_screen() {
         for words in ["oldest for", "512 made in the last hour", "123456.7 steps/s", "expected within 30 h"] {
             assert!(text.contains(words), "{words}: {text}");
         }
+    }
+}
+
+/// The output on a screen of 80 columns.
+fn on_a_screen(snapshot: &Snapshot) -> String {
+    let page = StatusLayout { width: 80, ..StatusLayout::unlimited().screen() };
+    let mut text = Vec::new();
+    write(&mut text, snapshot, &BatchJobs::None, page, None).unwrap();
+    String::from_utf8(text).unwrap()
+}
+
+#[test]
+fn a_campaign_in_which_nothing_has_begun_shows_what_there_is() {
+    let expected = "\
+campaign    07070707070707070707070707070707, reproducible mode
+state       not running (resume with calmwalk run)
+walks       none yet
+mixture     version 0
+candidates  0 seen, 0 accepted
+labels      none yet
+disk        1.0 MB now
+";
+    assert_eq!(on_a_screen(&empty()), expected);
+}
+
+#[test]
+fn a_stopped_campaign_has_unfinished_walks_and_no_expected_end() {
+    let text = on_a_screen(&stopped());
+    for line in [
+        "state       not running (resume with calmwalk run)\n",
+        "walks       2 unfinished, 1 ended (1 quota reached)\n",
+        "labels      2 queued, 7 labelled\n",
+        "0  bcc-100    stopped",
+        "1  bcc-100    waiting",
+    ] {
+        assert!(text.contains(line), "{line}: {text}");
+    }
+    assert!(!text.contains("steps/s") && !text.contains("\nend "), "{text}");
+}
+
+#[test]
+fn a_campaign_without_labels_says_why_and_what_to_change() {
+    let text = on_a_screen(&failed());
+    for words in [
+        "state       finished\n",
+        "walks       1 ended (1 diverged)\n            too hot: try ",
+        "labels      1 failed\n",
+        "failures    crashed in 1: 0 labelled, 1 failed, 0 unfinished\n",
+        "unlabelled  the labels of 1 structure failed, which leaves these ranges",
+    ] {
+        assert!(text.contains(words), "{words}: {text}");
     }
 }
 

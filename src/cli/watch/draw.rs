@@ -133,7 +133,8 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &WatchState, versions: Op
                 String::new()
             };
             let over = if ended > 0 { format!("{ended} ended; ") } else { String::new() };
-            format!("{going}{over}mixture version {}", status.mixture_version)
+            let none = if status.walks.is_empty() { "none yet; " } else { "" };
+            format!("{going}{over}{none}mixture version {}", status.mixture_version)
         }),
         (
             "candidates",
@@ -142,6 +143,7 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &WatchState, versions: Op
                 (*seen, format!("{accepted} accepted")),
                 (seen - accepted, format!("{} declined", seen - accepted)),
                 (*control, count(*control, "control frame")),
+                (u64::from(seen + control == 0), "none yet".to_owned()),
             ]
             .into_iter()
             .filter_map(|(number, text)| (number > 0).then_some(text))
@@ -221,7 +223,10 @@ fn draw_charts(frame: &mut Frame<'_>, area: Rect, state: &WatchState, theme: &Th
     let spread = charts
         .gamma()
         .map_or(String::new(), |(median, largest)| format!(": median {median:.2}, max {largest:.1}"));
-    let title = format!("γ₀_max of {}{spread}", charts.candidates());
+    let title = match charts.candidates() {
+        0 => "γ₀_max: no candidates yet".to_owned(),
+        candidates => format!("γ₀_max of {candidates}{spread}"),
+    };
     draw_chart(frame, left, &title, &counts, None, &axis(left.width, end), theme);
     let (shares, group) = charts.acceptance_history(right.width.into());
     let title = match charts.acceptance() {

@@ -138,6 +138,30 @@ fn all_panes_fit_a_small_terminal() {
 }
 
 #[test]
+fn a_campaign_in_which_nothing_has_begun_and_a_stopped_one_say_so() {
+    let of = |snapshot| Reading { snapshot, ..reading(Vec::new(), 1..1) };
+    let mut empty = WatchState::new(of(status::tests::empty()));
+    let text = screen(&mut empty, 80, 24);
+    for words in [
+        "reproducible mode: not running",
+        "walks       none yet; mixture version 0",
+        "candidates  none yet",
+        "labels      none yet",
+        "end         –",
+        "1 walks: 0",
+        "γ₀_max: no candidates yet",
+        "accepted: no candidates yet",
+    ] {
+        assert!(text.contains(words), "{words}:\n{text}");
+    }
+    let mut stopped = WatchState::new(of(status::tests::stopped()));
+    let text = screen(&mut stopped, 80, 24);
+    for words in ["walks       2 unfinished; 1 ended; mixture version 9", "stopped", "end         –"] {
+        assert!(text.contains(words), "{words}:\n{text}");
+    }
+}
+
+#[test]
 fn terminals_of_every_size_are_supported() {
     for width in [1, 2, 10, 40, 79, 150, 300] {
         for height in [1, 2, 3, 7, 13, 14, 16, 20, 22, 70] {

@@ -13,13 +13,17 @@ mod sse;
 mod static_files;
 mod time_series;
 
+use std::sync::Arc;
+
 use axum::Router;
 use axum::extract::{Path, State};
 use axum::middleware;
 use axum::routing::{get, post};
+use monitor::calibration::CalibrationReader;
 use monitor::mixture_status::InitialMixture;
 use monitor::walk_trace::WalkTrace;
 use store::Store;
+use tokio::sync::Mutex;
 use wire::WalkId;
 
 pub use self::actions::Mutations;
@@ -38,6 +42,8 @@ pub struct Dashboard {
     store: Store,
     feed: StatusFeed,
     errors: CachedResponse,
+    /// Keeps what labels teach about bounds of errors, so that later ones alone are read again.
+    calibrations: Arc<Mutex<CalibrationReader>>,
     mixture: CachedResponse,
     map: CachedResponse,
     /// The initial mixture, if this process runs the campaign.
@@ -51,7 +57,8 @@ impl Dashboard {
     pub fn new(store: Store, mutations: Option<Mutations>, initial: Option<InitialMixture>) -> Self {
         let feed = StatusFeed::start(store.clone());
         let [errors, mixture, map] = [(); 3].map(|()| CachedResponse::default());
-        Self { feed, errors, mixture, map, initial, store, mutations }
+        let calibrations = Arc::default();
+        Self { feed, errors, calibrations, mixture, map, initial, store, mutations }
     }
 
     /// Routes of the dashboard.

@@ -22,7 +22,7 @@ export function gallery(candidates, signal) {
     for (let card = waiting.shift(); card && !signal.aborted; card = waiting.shift()) {
       const found = await fetchJson(candidatePath(card.candidate.id, "/structure"), signal).catch(() => null);
       if (!found) {
-        card.canvas.replaceWith(element("span", { class: "quiet" }, "cannot be read"));
+        card.canvas.replaceWith(element("span", { class: "missing" }, "The structure cannot be read."));
         continue;
       }
       found.species.forEach((one) => seen.add(one));

@@ -31,6 +31,10 @@ export async function show(content, address, signal) {
     place.setAttribute("aria-busy", "true");
     try {
       draw(place, await fetchComputed("/api/map", signal), chosen);
+    } catch (error) {
+      // There is nothing to wait for.
+      if (error.name !== "AbortError") place.replaceChildren();
+      throw error;
     } finally {
       place.removeAttribute("aria-busy");
     }

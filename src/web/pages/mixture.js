@@ -26,6 +26,10 @@ export async function show(content, chosen, signal) {
       const mixture = await fetchComputed("/api/mixture", signal);
       place.removeAttribute("role");
       place.replaceChildren(...shown(mixture, decodeURIComponent(chosen)));
+    } catch (error) {
+      // Without the initial mixture there is nothing to wait for.
+      if (error.name !== "AbortError") place.replaceChildren();
+      throw error;
     } finally {
       place.removeAttribute("aria-busy");
     }

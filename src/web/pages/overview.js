@@ -104,7 +104,7 @@ function oneDevice({ device, busy_share, mean_batch, bonds_per_second }) {
 /** The elements that are forgotten most: by the share of their sampled atoms above 1, and without a sample by the growth of σ². */
 function forgotten(elements) {
   const most = (of) => elements.filter((one) => of(one) != null).toSorted((a, b) => of(b) - of(a)).slice(0, ELEMENTS);
-  const growth = (one) => `mean σ² of training atoms × ${one.mean_square_growth.toFixed(2)}`;
+  const growth = (one) => `mean σ² of training atoms\u00a0×\u00a0${one.mean_square_growth.toFixed(2)}`;
   return [
     ...most((one) => one.share_above_one).map((one) => `${one.element}: ${percent(one.share_above_one)} above 1, ${growth(one)}`),
     ...most((one) => (one.share_above_one == null ? one.mean_square_growth : null)).map((one) => `${one.element}: ${growth(one)}`),
@@ -138,6 +138,11 @@ function share(part, all) {
   return all > 0 ? part / all : null;
 }
 
+/** A value with its range, which may be too narrow to show. */
+function between(value, low, high) {
+  return low === value && high === value ? value : `${value} (${low} to ${high})`;
+}
+
 function queue(status) {
   const { oldest_lease: oldest, cost, failures } = status;
   const remaining = cost.queue.remaining;
@@ -145,7 +150,7 @@ function queue(status) {
     ["labels per hour", status.labels_per_hour == null ? null : digits(status.labels_per_hour, "/h")],
     ["oldest lease", oldest && `job ${oldest.job}, for ${duration(Date.now() - oldest.started)}, by ${oldest.holder}`],
     ["cost so far", coreTime(cost.core_hours)],
-    ["cost of the queue", remaining && `${coreTime(remaining.expected)} (${coreTime(remaining.low)} to ${coreTime(remaining.high)})`],
+    ["cost of the queue", remaining && between(...[remaining.expected, remaining.low, remaining.high].map(coreTime))],
   ]);
   const making = inProgress(status.labels_in_progress);
   if (failures.length === 0) return element("div", {}, list, making);

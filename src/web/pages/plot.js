@@ -74,7 +74,7 @@ function axis({ least, most, logarithmic, steps, ticks = tick }, values, from, t
     return from + ((place - low) / (high - low)) * (to - from);
   };
   const number = Math.abs(to - from) / (steps ? 70 : 55);
-  return { at, ticks: logarithmic ? roundPowers(low, high) : roundNumbers(low, high, number, steps), text: ticks };
+  return { at, ticks: logarithmic ? roundPowers(low, high, number) : roundNumbers(low, high, number, steps), text: ticks };
 }
 
 /** Range around a single value. It keeps the sign, and starts at 0 for a value of 0. */
@@ -93,12 +93,13 @@ function roundNumbers(low, high, number, steps) {
   return Array.from({ length: Math.floor(high / step + 1e-9) - first + 1 }, (_, k) => (first + k) * step);
 }
 
-/** Powers of ten between 10^low and 10^high, with factors of 2 and 5 if there are few. */
-function roundPowers(low, high) {
+/** Powers of ten between 10^low and 10^high, with factors of 2 and 5 if there are few; round numbers if there are fewer than two of them. */
+function roundPowers(low, high, number) {
   const factors = high - low < 2 ? [1, 2, 5] : [1];
   const powers = Array.from({ length: Math.ceil(high) - Math.floor(low) + 1 }, (_, k) => Math.floor(low) + k);
   const inside = (value) => value >= 10 ** low && value <= 10 ** high;
-  return powers.flatMap((power) => factors.map((factor) => factor * 10 ** power)).filter(inside);
+  const found = powers.flatMap((power) => factors.map((factor) => factor * 10 ** power)).filter(inside);
+  return found.length < 2 ? roundNumbers(10 ** low, 10 ** high, number) : found;
 }
 
 function grid(across, up, [width, height], left) {

@@ -32,6 +32,30 @@ impl SqlRow {
         T::from_column(self, index)
     }
 
+    /// A text, in place.
+    pub fn text(&self, index: impl Index) -> Result<Option<&str>> {
+        Ok(match self {
+            Self::Sqlite(row) => row.try_get(index)?,
+            Self::Postgres(row) => row.try_get(index)?,
+        })
+    }
+
+    /// Bytes, in place.
+    pub fn bytes(&self, index: impl Index) -> Result<Option<&[u8]>> {
+        Ok(match self {
+            Self::Sqlite(row) => row.try_get(index)?,
+            Self::Postgres(row) => row.try_get(index)?,
+        })
+    }
+
+    /// The index of the first column with a name.
+    pub fn place(&self, name: &str) -> Result<usize> {
+        Ok(match self {
+            Self::Sqlite(row) => ColumnIndex::index(&name, row)?,
+            Self::Postgres(row) => ColumnIndex::index(&name, row)?,
+        })
+    }
+
     /// The value of a column that tables of earlier versions lack.
     pub fn get_or_default<T: FromColumn + Default>(&self, name: &str) -> Result<T> {
         if self.has_column(name) { self.get(name) } else { Ok(T::default()) }

@@ -14,8 +14,8 @@ use crate::error::StoreError;
 use crate::records::{CampaignRecord, Commit, ComponentRecord};
 use crate::tables::{
     attempt_end, candidate_history, exclude, export, feature_sample, job_counts, label_arrivals,
-    label_values, listing, lower_states, outcomes, queue, queue_admin, recent, status, structures, versions,
-    without_label,
+    label_values, labelled, listing, lower_states, outcomes, queue, queue_admin, recent, status, structures,
+    versions, without_label,
 };
 
 /// The store in a directory, and its file.
@@ -81,10 +81,11 @@ async fn frequent_queries_use_indexes() {
         listing::SMALLEST_VOLUME,
         listing::OF_WALK,
         label_values::FINISHED_AFTER,
+        labelled::AFTER,
+        labelled::OF_DECISIONS,
         job_counts::LABELS_SINCE,
         label_arrivals::PAGE,
         outcomes::CORES_IN_USE,
-        outcomes::FINISHED,
         recent::NEWEST,
         status::ACCEPTED,
         versions::FILE,
@@ -105,6 +106,24 @@ async fn frequent_queries_use_indexes() {
             page.contains("SEARCH candidate USING COVERING INDEX") && page.contains("(id>? AND id<?)"),
             "{page}"
         );
+        assert!(!page.contains("SCAN"), "{page}");
+    }
+    for sql in [
+        listing::NEWEST_OF_STATE,
+        listing::OLDEST_OF_STATE,
+        listing::LARGEST_GAMMA_OF_STATE,
+        listing::SMALLEST_GAMMA_OF_STATE,
+        listing::LARGEST_VOLUME_OF_STATE,
+        listing::SMALLEST_VOLUME_OF_STATE,
+    ] {
+        let page = plan(&file, sql).await.replace("SCAN page", "");
+        assert!(page.contains("SEARCH job USING INDEX job_order (state=?)"), "{page}");
+        assert!(page.contains("SEARCH candidate USING INDEX candidate_structure"), "{page}");
+        assert!(!page.contains("SCAN"), "{page}");
+    }
+    for sql in [listing::NEWEST_WITHIN, listing::OLDEST_WITHIN] {
+        let page = plan(&file, sql).await.replace("SCAN page", "");
+        assert!(page.contains("SEARCH candidate USING INTEGER PRIMARY KEY (rowid>? AND rowid<?)"), "{page}");
         assert!(!page.contains("SCAN"), "{page}");
     }
     let sum = plan(&file, label_arrivals::SUM).await;

@@ -6,37 +6,23 @@ use wire::ContentHash;
 
 use super::decision_list::{decision_list, lists};
 use super::label_row::LabelRow;
-use super::restore::{block, grades, origin};
+use super::labelled::{labelled_candidates, labelled_columns, labelled_joins};
+use super::restore::origin;
 use crate::Store;
-use crate::checksum::{CANDIDATE, DECISION, IMPORT, Names, ORIGINAL_GRADES, SEED_STRUCTURE, WALK, joined};
+use crate::checksum::{DECISION, IMPORT, Names, SEED_STRUCTURE, WALK, joined};
 use crate::database::{FromRow, SqlRow, from_columns, query};
 use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
 use crate::export::{ExportCursor, ExportFilter, ExportRow, ExportSource, LabelMark};
+use crate::labelled::LabelledCandidate;
 
 macro_rules! candidates {
     ($which:expr, $limit:literal) => {
-        concat!(
-            "SELECT candidate.decision AS decision, original_checksum, block, original_grades, seed_structure.seed AS seed, ",
-            joined!(candidate),
-            ", ",
-            joined!(decision),
-            ", ",
-            joined!(seed_structure),
-            ", ",
-            joined!(structure),
-            ", label.*
-            FROM candidate
-            CROSS JOIN label ON label.structure = candidate.structure AND label.protocol = $1 AND status = 'label'
-            CROSS JOIN structure ON structure.number = candidate.structure
-            CROSS JOIN decision ON decision.sequence = candidate.decision
-            CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
-            LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
-            WHERE candidate.decision ",
+        labelled_candidates!(
+            concat!(", seed_structure.seed AS seed, ", joined!(decision), ", ", joined!(seed_structure)),
+            " CROSS JOIN decision ON decision.sequence = candidate.decision
+            LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure",
             $which,
-            " AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure AND job.protocol = $1
-                              AND state = 'dropped')
-            ORDER BY candidate.decision",
             $limit
         )
     };
@@ -200,15 +186,9 @@ impl Store {
     }
 }
 
-/// A row with the columns of [`CANDIDATES`].
-pub(super) fn candidate(row: &SqlRow, protocol_name: &str, protocol: ContentHash) -> Result<ExportRow> {
-    CANDIDATE.verify(row, Names::Joined)?;
+fn candidate(row: &SqlRow, protocol_name: &str, protocol: ContentHash) -> Result<ExportRow> {
+    let found = LabelledCandidate::from_row(row)?;
     DECISION.verify(row, Names::Joined)?;
-    ORIGINAL_GRADES.verify(row)?;
-    let id: String = row.get("candidate__id")?;
-    if row.get::<Vec<u8>>("candidate__content")? != row.get::<Vec<u8>>("structure__hash")? {
-        return Err(StoreError::damaged(format!("candidate {id}"), "its structure is a different one"));
-    }
     let seed_structure_name = match row.get::<Option<i64>>("seed")? {
         None => String::new(),
         Some(_) => {
@@ -216,35 +196,26 @@ pub(super) fn candidate(row: &SqlRow, protocol_name: &str, protocol: ContentHash
             row.get("seed_structure__name")?
         }
     };
+    let LabelledCandidate { decision, seed_structure, structure, block, original, label, .. } = found;
     let source = ExportSource::Candidate {
-        block: block(row, &id)?,
-        id,
-        seed_structure: row.get("candidate__seed_structure")?,
+        id: row.get("candidate__id")?,
+        seed_structure,
         seed_structure_name,
-        origin: origin(&row.get::<String>("candidate__origin")?)?,
+        origin: block.view().origin(),
         mixture_version_after: row.get("decision__mixture_version")?,
         selector_gamma: row.get("candidate__selector_gamma")?,
-        original: grades(row.get::<Option<Vec<u8>>>("original_grades")?.as_deref())?,
+        original,
+        block,
     };
-    labelled(row, ExportCursor::Candidate(row.get("decision")?), source, protocol_name, protocol)
+    let (cursor, protocol_name) = (ExportCursor::Candidate(decision), protocol_name.to_owned());
+    Ok(ExportRow { cursor, source, structure, label, protocol_name, protocol })
 }
 
 fn import(row: &SqlRow, protocol_name: &str, protocol: ContentHash) -> Result<ExportRow> {
     IMPORT.verify(row, Names::Joined)?;
-    let source = ExportSource::Import { file: row.get("import__file")?, frame: row.get("import__frame")? };
-    labelled(row, ExportCursor::Import(row.get("place")?), source, protocol_name, protocol)
-}
-
-fn labelled(
-    row: &SqlRow,
-    cursor: ExportCursor,
-    source: ExportSource,
-    protocol_name: &str,
-    protocol: ContentHash,
-) -> Result<ExportRow> {
     Ok(ExportRow {
-        cursor,
-        source,
+        cursor: ExportCursor::Import(row.get("place")?),
+        source: ExportSource::Import { file: row.get("import__file")?, frame: row.get("import__frame")? },
         structure: read_structure(row)?,
         label: LabelRow::from_row(row)?.into_record()?.label,
         protocol_name: protocol_name.to_owned(),

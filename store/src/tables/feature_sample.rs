@@ -5,17 +5,16 @@ use std::ops::Range;
 use wire::{ContentHash, Origin};
 
 use super::decision_list::{decision_list, lists};
-use super::label_row::LabelRow;
+use super::report::{collected, job_and_forces, protocol_number};
 use super::restore::{block, grades};
 use crate::Store;
 use crate::checksum::{CANDIDATE, LONG_COLUMNS, Names, joined};
 use crate::database::{FromRow, SqlRow, query};
 use crate::error::Result;
 use crate::numbers::decode_numbers;
-use crate::records::JobState;
 use crate::report::{CollectedFeatures, DecisionSample};
 
-macro_rules! collected {
+macro_rules! accepted {
     ($what:literal, $which:literal) => {
         concat!(
             "SELECT ",
@@ -26,34 +25,22 @@ macro_rules! collected {
     };
 }
 
-pub(crate) const NUMBER: &str = collected!("count(*)", "");
-const NUMBER_OF_WALKS: &str = collected!("count(*)", " AND walk >= $2 AND walk < $3");
+pub(crate) const NUMBER: &str = accepted!("count(*)", "");
+const NUMBER_OF_WALKS: &str = accepted!("count(*)", " AND walk >= $2 AND walk < $3");
 
 /// Multiples of 0.618033, about the golden ratio, modulo 1 fill the interval evenly, whatever the period in which walks take turns. Those
 /// of decisions below a share of the interval are this share of them.
-pub(crate) const SAMPLED: &str = collected!(
+pub(crate) const SAMPLED: &str = accepted!(
     "decision",
     " AND decision * 618033 % 1000000 < $2 AND walk >= $3 AND walk < $4 ORDER BY decision"
 );
 /// The share that is all.
 const ALL: i64 = 1_000_000;
 
-pub(crate) const FEATURES: &str = concat!(
-    "SELECT candidate.decision AS decision, features_checksum, selector_checksum, original_checksum, block, features,
-    selector_grades, original_grades, state AS job_state, ",
-    joined!(candidate),
-    ", label.*
-    FROM candidate
-    CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
-    LEFT JOIN job ON job.structure = candidate.structure AND job.protocol = $1
-    LEFT JOIN label ON label.structure = candidate.structure AND label.protocol = $1 AND status = 'label'
-    WHERE candidate.decision IN ",
-    decision_list!(),
-    " ORDER BY candidate.decision"
+pub(crate) const FEATURES: &str = collected!(
+    "features_checksum, selector_checksum, features, selector_grades, ",
+    concat!("IN ", decision_list!(), " ORDER BY candidate.decision")
 );
-
-/// No protocol has it.
-const NO_PROTOCOL: i64 = -1;
 
 impl Store {
     /// Decisions on about `room` accepted candidates, or frames of control walks, of these walks, evenly spread over the decision
@@ -83,10 +70,7 @@ impl Store {
         decisions: &[i64],
     ) -> Result<Vec<CollectedFeatures>> {
         let mut transaction = self.database.begin_read().await?;
-        let number = match protocol {
-            Some(protocol) => super::protocols::protocol_id(&mut transaction, protocol).await?,
-            None => NO_PROTOCOL,
-        };
+        let number = protocol_number(&mut transaction, protocol).await?;
         let mut found = Vec::new();
         for list in lists(decisions) {
             let page = query(FEATURES).bind(number).bind_all(list);
@@ -101,18 +85,14 @@ impl FromRow for CollectedFeatures {
     fn from_row(row: &SqlRow) -> Result<Self> {
         CANDIDATE.verify(row, Names::Joined)?;
         LONG_COLUMNS.iter().try_for_each(|column| column.verify(row))?;
-        let [features, selector, original]: [Option<Vec<u8>>; 3] =
-            [row.get("features")?, row.get("selector_grades")?, row.get("original_grades")?];
-        let job = row.get::<Option<String>>("job_state")?.and_then(|state| JobState::named(&state));
-        let has_label = row.get::<Option<i64>>("number")?.is_some();
-        let label = (has_label && job != Some(JobState::Dropped)).then(|| LabelRow::from_row(row));
+        let features = row.bytes("features")?.map(decode_numbers);
         Ok(Self {
             decision: row.get("decision")?,
             block: block(row, &row.get::<String>("candidate__id")?)?,
-            features: features.map(|bytes| decode_numbers(&bytes)).transpose()?,
-            selector: grades(selector.as_deref())?,
-            original: grades(original.as_deref())?,
-            label_forces: label.transpose()?.map(LabelRow::forces).transpose()?,
+            features: features.transpose()?,
+            selector: grades(row.bytes("selector_grades")?)?,
+            original: grades(row.bytes("original_grades")?)?,
+            label_forces: job_and_forces(row)?.1,
         })
     }
 }

@@ -2,34 +2,20 @@
 
 use wire::ContentHash;
 
-use super::export;
+use super::labelled::{labelled_columns, labelled_joins};
 use crate::Store;
 use crate::checksum::joined;
-use crate::database::{SqlRow, query};
+use crate::database::{FromRow, SqlRow, query};
 use crate::error::{Result, StoreError};
-use crate::export::{ArrivalSum, LabelArrival};
+use crate::labelled::{ArrivalSum, LabelArrival, LabelledCandidate};
 
 pub(crate) const PAGE: &str = concat!(
-    "SELECT candidate.decision AS decision, label.number AS label_number, original_checksum, block, original_grades,
-    seed_structure.seed AS seed, ",
-    joined!(candidate),
-    ", ",
-    joined!(decision),
-    ", ",
-    joined!(seed_structure),
-    ", ",
-    joined!(structure),
-    ", label.*
-    FROM label
-    CROSS JOIN candidate ON candidate.structure = label.structure
-    CROSS JOIN structure ON structure.number = candidate.structure
-    CROSS JOIN decision ON decision.sequence = candidate.decision
-    CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
-    LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
-    WHERE label.number >= $2 AND (label.number > $2 OR candidate.decision > $3)
-    AND label.protocol = $1 AND status = 'label'
-    AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = label.structure AND job.protocol = $1
-                    AND state = 'dropped')
+    "SELECT label.number AS label_number, ",
+    labelled_columns!(),
+    " FROM label CROSS JOIN candidate ON candidate.structure = label.structure",
+    labelled_joins!(),
+    " WHERE label.number >= $2 AND (label.number > $2 OR candidate.decision > $3)
+    AND label.protocol = $1 AND status = 'label' AND coalesce(job.state, '') <> 'dropped'
     ORDER BY label.number, candidate.decision LIMIT $4"
 );
 
@@ -56,18 +42,9 @@ impl Store {
         after: Option<(i64, i64)>,
         limit: u32,
     ) -> Result<Vec<LabelArrival>> {
-        let (number, name) = self.protocol_of_arrivals(protocol).await?;
+        let number = self.protocol_number(protocol).await?;
         let (label, decision) = after.unwrap_or((0, 0));
-        let page = query(PAGE).bind(number).bind(label).bind(decision).bind(limit);
-        let rows = page.rows(&self.database).await?;
-        let arrival = |row: &SqlRow| {
-            Ok(LabelArrival {
-                number: row.get("label_number")?,
-                decision: row.get("decision")?,
-                row: export::candidate(row, &name, protocol)?,
-            })
-        };
-        rows.iter().map(arrival).collect()
+        query(PAGE).bind(number).bind(label).bind(decision).bind(limit).fetch_all(&self.database).await
     }
 
     /// The sum over all labelled candidates up to the label and the decision of `until` (`None`: over none). A reader that has
@@ -81,17 +58,27 @@ impl Store {
         protocol: ContentHash,
         until: Option<(i64, i64)>,
     ) -> Result<ArrivalSum> {
-        let (number, _) = self.protocol_of_arrivals(protocol).await?;
+        let number = self.protocol_number(protocol).await?;
         let Some((label, decision)) = until else { return Ok(ArrivalSum::default()) };
         let sum = query(SUM).bind(number).bind(label).bind(decision);
         let (rows, sum) = sum.fetch_one(&self.database).await?;
         Ok(ArrivalSum { rows, sum })
     }
 
-    /// Number and name of a protocol.
-    async fn protocol_of_arrivals(&self, protocol: ContentHash) -> Result<(i64, String)> {
-        let found = query("SELECT number, name FROM protocol WHERE hash = $1").bind(protocol.0.to_vec());
-        let found: Option<(i64, String)> = found.fetch_optional(&self.database).await?;
+    /// Number of the newest label of any protocol; 0 without one.
+    pub async fn newest_label(&self) -> Result<i64> {
+        query("SELECT coalesce(max(number), 0) FROM label").fetch_one(&self.database).await
+    }
+
+    async fn protocol_number(&self, protocol: ContentHash) -> Result<i64> {
+        let found = query("SELECT number FROM protocol WHERE hash = $1").bind(protocol.0.to_vec());
+        let found = found.fetch_optional(&self.database).await?;
         found.ok_or_else(|| StoreError::UnknownProtocol(protocol.to_string()))
+    }
+}
+
+impl FromRow for LabelArrival {
+    fn from_row(row: &SqlRow) -> Result<Self> {
+        Ok(Self { number: row.get("label_number")?, candidate: LabelledCandidate::from_row(row)? })
     }
 }

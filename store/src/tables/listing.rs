@@ -1,5 +1,7 @@
 //! Pages of the candidate table. Each query reads an index from the first row of the page, so its cost does not
-//! depend on the number of rows.
+//! depend on the number of rows; those of a state read the jobs that have it.
+
+use std::ops::Range;
 
 use super::label_row::LabelRow;
 use super::label_values::decode_factors;
@@ -7,7 +9,7 @@ use crate::Store;
 use crate::checksum::{CANDIDATE, DECISION, Names, joined};
 use crate::database::{FromRow, SqlRow, query};
 use crate::error::Result;
-use crate::listing::{ListCursor, ListOrder, ListedCandidate};
+use crate::listing::{ListCursor, ListLimits, ListOrder, ListedCandidate};
 use crate::records::{JobState, Label};
 
 impl FromRow for ListedCandidate {
@@ -133,6 +135,66 @@ macro_rules! decided_of_walk {
 pub(crate) const NEWEST_OF_WALK: &str = decided_of_walk!("<", " DESC");
 pub(crate) const OLDEST_OF_WALK: &str = decided_of_walk!(">", "");
 
+/// The jobs of a state lead to their candidates: all of them are read. An origin of NULL stands for both.
+macro_rules! of_state {
+    ($which:literal, $order:literal) => {
+        lines!(
+            "FROM (SELECT candidate.decision AS place FROM job
+                CROSS JOIN candidate ON candidate.structure = job.structure
+                WHERE job.state = $1 AND ($2 IS NULL OR origin = $2)
+                AND NOT EXISTS (SELECT 1 FROM job AS newer
+                                WHERE newer.structure = job.structure AND newer.number > job.number)
+                AND ",
+            $which,
+            " ORDER BY ",
+            $order,
+            " LIMIT $3) AS page CROSS JOIN candidate ON candidate.decision = place",
+            joins!(),
+            " ORDER BY ",
+            $order
+        )
+    };
+}
+
+pub(crate) const NEWEST_OF_STATE: &str = of_state!("candidate.decision < $4", "candidate.decision DESC");
+pub(crate) const OLDEST_OF_STATE: &str = of_state!("candidate.decision > $4", "candidate.decision");
+pub(crate) const LARGEST_GAMMA_OF_STATE: &str = of_state!(
+    "(original_gamma, candidate.decision) < ($5, $4)",
+    "original_gamma DESC, candidate.decision DESC"
+);
+pub(crate) const SMALLEST_GAMMA_OF_STATE: &str =
+    of_state!("(original_gamma, candidate.decision) > ($5, $4)", "original_gamma, candidate.decision");
+pub(crate) const LARGEST_VOLUME_OF_STATE: &str = of_state!(
+    "(relative_volume, candidate.decision) < ($5, $4)",
+    "relative_volume DESC, candidate.decision DESC"
+);
+pub(crate) const SMALLEST_VOLUME_OF_STATE: &str =
+    of_state!("(relative_volume, candidate.decision) > ($5, $4)", "relative_volume, candidate.decision");
+
+/// A range of the table is read for the decisions; only the rows of the page with what belongs to them.
+macro_rules! within {
+    ($way:literal) => {
+        lines!(
+            "FROM (SELECT decision AS place FROM candidate WHERE decision >= $1 AND decision < $2
+                AND ($4 IS NULL OR (origin = $4 AND fate = $5 AND reason IS NOT DISTINCT FROM $6))
+                AND ($7 IS NULL OR original_gamma >= $7) AND ($8 IS NULL OR original_gamma <= $8)
+                AND ($9 IS NULL OR relative_volume >= $9) AND ($10 IS NULL OR relative_volume <= $10)
+                ORDER BY decision",
+            $way,
+            " LIMIT $3) AS page CROSS JOIN candidate ON candidate.decision = place",
+            joins!(),
+            " ORDER BY candidate.decision",
+            $way
+        )
+    };
+}
+
+pub(crate) const NEWEST_WITHIN: &str = within!(" DESC");
+pub(crate) const OLDEST_WITHIN: &str = within!("");
+
+const MORE_JOBS_THAN: &str =
+    "SELECT count(*) > $2 FROM (SELECT 1 AS one FROM job WHERE state = $1 LIMIT $2 + 1) AS found";
+
 /// The index gives the jobs; only those of the page are read. Jobs of imported structures, whose numbers are above all
 /// decisions, are left out.
 pub(crate) const QUEUE: &str = lines!(
@@ -196,6 +258,60 @@ impl Store {
             after.unwrap_or(ListCursor { decision: 0, ..first(true) });
         let query = query(QUEUE).bind(state.name()).bind(priority).bind(value).bind(decision);
         query.bind(limit).fetch_all(&self.database).await
+    }
+
+    /// At most `limit` of the candidates of these decisions that are within limits, in decision order. `fate`: origin and reason as
+    /// for [`Self::list_fate`]; `None` for any.
+    pub async fn list_within(
+        &self,
+        decisions: Range<i64>,
+        limits: ListLimits,
+        fate: Option<(&str, Option<&str>)>,
+        descending: bool,
+        limit: u32,
+    ) -> Result<Vec<ListedCandidate>> {
+        let query = query(if descending { NEWEST_WITHIN } else { OLDEST_WITHIN });
+        let query = query.bind(decisions.start).bind(decisions.end).bind(limit);
+        let (origin, reason) = fate.unzip();
+        let reason = reason.flatten();
+        let fate = if reason.is_some() { "declined" } else { "accepted" };
+        let query = query.bind(origin).bind(fate).bind(reason);
+        let values = limits.gamma.into_iter().chain(limits.relative_volume);
+        values.fold(query, |query, value| query.bind(value)).fetch_all(&self.database).await
+    }
+
+    /// The newest decision on a candidate; 0 without one.
+    pub async fn newest_candidate(&self) -> Result<i64> {
+        query("SELECT coalesce(max(decision), 0) FROM candidate").fetch_one(&self.database).await
+    }
+
+    /// At most `limit` candidates whose newest label job has a state, of one origin or (`None`) both, as
+    /// [`Self::list_candidates`]. Reads all jobs of that state.
+    pub async fn list_state(
+        &self,
+        state: JobState,
+        origin: Option<&str>,
+        (order, descending): (ListOrder, bool),
+        after: Option<ListCursor>,
+        limit: u32,
+    ) -> Result<Vec<ListedCandidate>> {
+        let ListCursor { value, decision, .. } = after.unwrap_or(first(descending));
+        let sql = match (order, descending) {
+            (ListOrder::Decision, true) => NEWEST_OF_STATE,
+            (ListOrder::Decision, false) => OLDEST_OF_STATE,
+            (ListOrder::Gamma, true) => LARGEST_GAMMA_OF_STATE,
+            (ListOrder::Gamma, false) => SMALLEST_GAMMA_OF_STATE,
+            (ListOrder::Volume, true) => LARGEST_VOLUME_OF_STATE,
+            (ListOrder::Volume, false) => SMALLEST_VOLUME_OF_STATE,
+        };
+        let query = query(sql).bind(state.name()).bind(origin).bind(limit).bind(decision);
+        let query = if order == ListOrder::Decision { query } else { query.bind(value) };
+        query.fetch_all(&self.database).await
+    }
+
+    /// Whether more than `number` label jobs have a state. Counts no further.
+    pub async fn has_more_jobs(&self, state: JobState, number: u32) -> Result<bool> {
+        query(MORE_JOBS_THAN).bind(state.name()).bind(number).fetch_one(&self.database).await
     }
 
     /// Candidates of a walk, ordered by step. Returns only some if the walk has more than `limit`.

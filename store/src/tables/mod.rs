@@ -19,6 +19,7 @@ pub mod job_counts;
 pub mod label_arrivals;
 pub mod label_row;
 pub mod label_values;
+pub mod labelled;
 mod labels;
 pub mod listing;
 pub mod logs;

@@ -2,14 +2,11 @@
 
 use wire::ContentHash;
 
-use super::restore::{grades, origin};
 use super::{job_counts, protocols, walk_conditions};
 use crate::Store;
-use crate::checksum::{CANDIDATE, Names, ORIGINAL_GRADES, joined};
 use crate::database::{FromRow, SqlRow, query};
-use crate::encoding::decode_hash;
 use crate::error::Result;
-use crate::outcomes::{FailureCount, FinishedCandidate, LabelCost, LabelUsage, Unlabelled, ValueRange};
+use crate::outcomes::{FailureCount, LabelCost, LabelUsage, Unlabelled, ValueRange};
 
 /// The newest first: the cost of labels may change with the machine. Imported structures have no seed structure.
 pub(crate) const COSTS: &str =
@@ -79,24 +76,6 @@ const FAILED: &str = "SELECT CASE WHEN failure.seed_structure = 4294967295 THEN 
           WHERE job.state = 'failed' AND job.protocol = $1) AS failure
     LEFT JOIN seed_structure ON seed_structure.seed = failure.seed_structure
     GROUP BY failure.seed_structure, name, failure.formula ORDER BY failure.seed_structure, failure.formula";
-
-pub(crate) const FINISHED: &str = concat!(
-    "SELECT candidate.decision AS decision, CASE state WHEN 'failed' THEN 'failed' ELSE 'labelled' END AS job_state,
-        coalesce(name, '') AS seed_name, original_checksum, ",
-    joined!(candidate),
-    ", CASE WHEN state = 'failed' THEN original_grades END AS original_grades,
-        CASE WHEN state = 'failed' THEN (SELECT class FROM attempt WHERE attempt.job = job.number
-                                         AND attempt.attempt = job.attempts) END AS class
-    FROM candidate CROSS JOIN job ON job.structure = candidate.structure AND job.protocol = $2
-    CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
-    LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
-    WHERE candidate.decision > $1 AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
-        AND label.protocol = job.protocol AND status = 'excluded')
-    AND (job.state IN ('labelled', 'failed')
-        OR (job.state IN ('queued', 'leased') AND EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
-            AND label.protocol = job.protocol AND status = 'label')))
-    ORDER BY candidate.decision LIMIT $3"
-);
 
 /// Labels of structures that were not dropped, each counted with the walk that found its structure first.
 const LABELS_BY_WALK: &str = "SELECT candidate.walk, count(*)
@@ -181,22 +160,6 @@ impl Store {
         transaction.commit().await?;
         Ok(rows)
     }
-
-    /// At most `limit` candidates with finished jobs (labelled or failed) under this protocol, after decision
-    /// `after` (0: from the first). An empty page is the end.
-    pub async fn finished(
-        &self,
-        protocol: ContentHash,
-        after: i64,
-        limit: u32,
-    ) -> Result<Vec<FinishedCandidate>> {
-        let mut transaction = self.database.begin_read().await?;
-        let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
-        let page = query(FINISHED).bind(after).bind(protocol).bind(limit);
-        let page = page.fetch_all(&mut transaction).await?;
-        transaction.commit().await?;
-        Ok(page)
-    }
 }
 
 impl FromRow for LabelCost {
@@ -229,36 +192,6 @@ impl FromRow for Unlabelled {
             gamma_labelled: range("labelled_gamma_low", "labelled_gamma_high")?,
             relative_volume: range("volume_low", "volume_high")?,
             relative_volume_labelled: range("labelled_volume_low", "labelled_volume_high")?,
-        })
-    }
-}
-
-impl FromRow for FinishedCandidate {
-    fn from_row(row: &SqlRow) -> Result<Self> {
-        CANDIDATE.verify(row, Names::Joined)?;
-        let labelled = row.get::<String>("job_state")? == "labelled";
-        let unlabelled = match labelled {
-            true => None,
-            false => {
-                ORIGINAL_GRADES.verify(row)?;
-                Some(grades(row.get::<Option<Vec<u8>>>("original_grades")?.as_deref())?)
-            }
-        };
-        Ok(Self {
-            decision: row.get("decision")?,
-            candidate: row.get("candidate__id")?,
-            walk: row.get("candidate__walk")?,
-            step: row.get("candidate__step")?,
-            content: decode_hash(&row.get::<Vec<u8>>("candidate__content")?)?,
-            labelled,
-            origin: origin(&row.get::<String>("candidate__origin")?)?,
-            seed_structure: row.get("seed_name")?,
-            formula: row.get("candidate__formula")?,
-            gamma: row.get("candidate__original_gamma")?,
-            gamma_nbr: row.get("candidate__original_gamma_nbr")?,
-            relative_volume: row.get("candidate__relative_volume")?,
-            class: row.get("class")?,
-            unlabelled,
         })
     }
 }

@@ -299,7 +299,8 @@ impl FromRow for StoredCandidate {
 
 /// The block of a row. It must belong to the candidate of this name.
 pub(super) fn block(row: &SqlRow, id: &str) -> Result<CandidateBlock> {
-    let block = CandidateBlock::from_bytes(&row.get::<Vec<u8>>("block")?)?;
+    let missing = || StoreError::damaged(format!("candidate {id}"), "its block is missing");
+    let block = CandidateBlock::from_bytes(row.bytes("block")?.ok_or_else(missing)?)?;
     let found = block.view().id().to_string();
     match found == id {
         true => Ok(block),

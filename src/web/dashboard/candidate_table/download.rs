@@ -19,9 +19,9 @@ use crate::web::dashboard::Dashboard;
 use crate::web::dashboard::candidate::frame_of;
 use crate::web::dashboard::response::{ApiError, ApiResult};
 
-/// Largest number of structures in a file, and of candidates searched for them.
+/// Largest number of structures in a file, and of candidates read for them.
 const MAX_STRUCTURES: usize = 2000;
-const MAX_SEARCHED: usize = 100_000;
+const MAX_READ: usize = 100_000;
 /// Structures in memory at a time.
 const PAGE: usize = 32;
 
@@ -46,11 +46,11 @@ pub async fn extxyz(State(dashboard): State<Dashboard>, RawQuery(query): RawQuer
         (query.order, query.ascending) = (TableOrder::Decision, false);
     }
     let store = dashboard.store;
-    let found = query.collect(&store, None, MAX_STRUCTURES + 1, MAX_SEARCHED).await?;
+    let found = query.collect(&store, None, MAX_STRUCTURES + 1, (MAX_READ, usize::MAX)).await?;
     if found.rows.len() > MAX_STRUCTURES || found.next.is_some() {
         let why = match found.rows.len() > MAX_STRUCTURES {
             true => format!("more than {MAX_STRUCTURES} structures match"),
-            false => format!("only {MAX_SEARCHED} candidates are searched for a file"),
+            false => format!("only {MAX_READ} candidates are searched for a file"),
         };
         let what = "narrow the selection, or use calmwalk export --where on the host of the campaign";
         return Err(ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, format!("{why}: {what}")));

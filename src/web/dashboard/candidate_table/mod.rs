@@ -4,6 +4,7 @@
 mod columns;
 pub mod download;
 mod query;
+mod rows;
 mod sorted;
 
 use std::collections::{BTreeMap, HashMap};
@@ -12,21 +13,23 @@ use atoms::Species;
 use axum::extract::{RawQuery, State};
 use monitor::candidate_errors::ErrorReader;
 use serde_json::json;
-use store::{ListCursor, ListOrder, ListedCandidate, NO_LABEL_VALUE, Store, StoreError};
+use store::{ListCursor, ListedCandidate, Store, StoreError};
 use wire::{WalkConditions, WalkId};
 
 use self::columns::TableRow;
 use self::query::{CandidateQuery, PagePlace, TableOrder};
 use super::Dashboard;
 use super::response::{ApiResult, json};
-use crate::filter::{StructureFilter, StructureProperties, species};
+use crate::filter::{StructureProperties, species};
 
 /// Largest number of rows of a page, and the number without `limit`.
 const MAX_PAGE_ROWS: u32 = 200;
 const DEFAULT_ROWS: u32 = 50;
-/// Candidates read at a time when rows are filtered, and the largest number scanned for a response.
+/// Candidates read at a time when rows are filtered, and the largest number read for a response.
 const SCAN_ROWS: u32 = 1000;
 const MAX_SCANNED: usize = 10_000;
+/// The largest number searched for a response, where the store reads only those within limits.
+const MAX_SEARCHED: usize = 500_000;
 
 /// Rows of the table.
 #[derive(Debug, Default)]
@@ -72,94 +75,48 @@ impl CandidateQuery {
     /// A page in an order that has an index.
     async fn page(&self, store: &Store) -> Result<CandidatePage, StoreError> {
         let limit = self.limit.unwrap_or(DEFAULT_ROWS);
-        self.collect(store, self.cursor(), limit as usize, MAX_SCANNED).await
+        self.collect(store, self.cursor(), limit as usize, (MAX_SCANNED, MAX_SEARCHED)).await
     }
 
-    /// At most `limit` matching rows behind a cursor, in an order that has an index.
+    /// At most `limit` matching rows behind a cursor, in an order that has an index. Ends after a number of candidates that were read,
+    /// or that were searched.
     async fn collect(
         &self,
         store: &Store,
         after: Option<ListCursor>,
         limit: usize,
-        max_scanned: usize,
+        (max_read, max_searched): (usize, usize),
     ) -> Result<CandidatePage, StoreError> {
-        let window = if self.filters_rows() { SCAN_ROWS } else { SCAN_ROWS.min(limit as u32) };
+        let lead = self.lead(store).await?;
+        let window = if self.filters_rows(lead) { SCAN_ROWS } else { SCAN_ROWS.min(limit as u32) };
         let (mut page, mut place, mut elements) = (CandidatePage::default(), after, HashMap::new());
         let conditions = match self.filter {
             Some(_) => store.walk_conditions().await?,
             None => BTreeMap::new(),
         };
+        let mut read = 0;
         loop {
-            let rows = self.rows(store, place, window).await?;
-            let is_last = rows.len() < window as usize;
-            for row in rows {
-                page.scanned += 1;
-                place = Some(self.cursor_of(&row));
-                if self.matches(&row, &mut elements, &conditions) {
-                    page.rows.push(row);
+            let found = self.read(store, lead, place, window).await?;
+            for (row, searched) in found.rows.into_iter().zip(1..) {
+                read += 1;
+                if !self.matches(&row, &mut elements, &conditions) {
+                    continue;
                 }
+                place = Some(self.cursor_of(&row));
+                page.rows.push(row);
                 if page.rows.len() == limit {
+                    page.scanned += searched;
                     page.next = place;
                     return Ok(page);
                 }
             }
-            if is_last || page.scanned >= max_scanned {
-                page.next = place.filter(|_| !is_last);
+            page.scanned += found.searched;
+            place = found.next;
+            if place.is_none() || read >= max_read || page.scanned >= max_searched {
+                page.next = place;
                 return Ok(page);
             }
         }
-    }
-
-    /// Whether rows that are read may be filtered out.
-    fn filters_rows(&self) -> bool {
-        let has_order = !matches!(self.order, TableOrder::Decision | TableOrder::Column(_));
-        let by_fate = self.fate.is_some() && has_order;
-        let by_state = self.state.is_some() && self.order != TableOrder::Queue;
-        by_fate || by_state || self.filter.is_some()
-    }
-
-    async fn rows(
-        &self,
-        store: &Store,
-        after: Option<ListCursor>,
-        limit: u32,
-    ) -> Result<Vec<ListedCandidate>, StoreError> {
-        // By a column, the newest are sorted.
-        let descending = !self.ascending || matches!(self.order, TableOrder::Column(_));
-        let walk = self.filter.as_ref().and_then(StructureFilter::only_walk);
-        if let (TableOrder::Decision | TableOrder::Column(_), Some(walk)) = (self.order, walk) {
-            let after = after.map(|place| place.decision);
-            return store.list_decided_of_walk(walk, descending, after, limit).await;
-        }
-        let order = match (self.order, self.state, self.fate.as_deref()) {
-            (TableOrder::Queue, Some(state), _) => {
-                return store.list_queue(state, after, limit).await;
-            }
-            (TableOrder::Decision | TableOrder::Column(_), _, Some(fate)) => {
-                let (origin, reason) = match fate {
-                    "control" => ("control", None),
-                    "accepted" => ("biased", None),
-                    reason => ("biased", Some(reason)),
-                };
-                let after = after.map(|place| place.decision);
-                return store.list_fate(origin, reason, descending, after, limit).await;
-            }
-            (TableOrder::Gamma, ..) => ListOrder::Gamma,
-            (TableOrder::RelativeVolume, ..) => ListOrder::Volume,
-            (TableOrder::Decision | TableOrder::Queue | TableOrder::Column(_), ..) => ListOrder::Decision,
-        };
-        store.list_candidates(order, descending, after, limit).await
-    }
-
-    fn cursor_of(&self, row: &ListedCandidate) -> ListCursor {
-        let value = match self.order {
-            TableOrder::Decision | TableOrder::Column(_) => None,
-            TableOrder::Gamma => row.gamma,
-            TableOrder::RelativeVolume => row.relative_volume,
-            TableOrder::Queue => Some(row.value.unwrap_or(NO_LABEL_VALUE)),
-        };
-        let priority = row.priority.unwrap_or_default();
-        ListCursor { priority, value: value.unwrap_or_default(), decision: row.decision }
     }
 
     /// `elements` caches the species of formulas.

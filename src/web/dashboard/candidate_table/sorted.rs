@@ -36,7 +36,7 @@ pub(super) async fn page(
     versions: &WalkVersions,
     reader: &mut ErrorReader,
 ) -> Result<SortedPage, StoreError> {
-    let found = query.collect(store, None, MAX_SCANNED, MAX_SCANNED).await?;
+    let found = query.collect(store, None, MAX_SCANNED, (MAX_SCANNED, usize::MAX)).await?;
     let mut is_all = found.next.is_none();
     let mut rows: Vec<_> = found.rows.into_iter().map(|one| TableRow::new(one, versions)).collect();
     if column.is_error() {

@@ -1,0 +1,188 @@
+//! Rows of the table as the store has them: which index leads to those of a query.
+
+use store::{
+    JobState, ListCursor, ListLimits, ListOrder, ListedCandidate, NO_LABEL_VALUE, Store, StoreError,
+};
+
+use super::query::{CandidateQuery, TableOrder};
+use crate::filter::{NumberField, StructureFilter};
+
+/// Up to this number of jobs, those of a state lead to its candidates. With more, they are found among all candidates.
+const MAX_JOBS_OF_STATE: u32 = 100_000;
+/// Decisions that are searched at a time for candidates within limits.
+const SEARCHED_DECISIONS: i64 = 100_000;
+
+/// What leads to rows.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum RowLead {
+    /// The index of an order.
+    Order,
+    /// The label jobs of a state.
+    State(JobState),
+    /// The decisions up to the newest, of which the store returns those within limits.
+    Limits(ListLimits, i64),
+}
+
+/// Rows that were read at once.
+#[derive(Debug)]
+pub(super) struct FoundRows {
+    pub rows: Vec<ListedCandidate>,
+    /// Number of candidates that were searched for them.
+    pub searched: usize,
+    /// Where to continue; `None` at the end.
+    pub next: Option<ListCursor>,
+}
+
+impl CandidateQuery {
+    /// What leads to the rows.
+    pub async fn lead(&self, store: &Store) -> Result<RowLead, StoreError> {
+        if self.order == TableOrder::Queue || (self.is_by_decision() && self.only_walk().is_some()) {
+            return Ok(RowLead::Order);
+        }
+        if let Some(state) = self.state
+            && !store.has_more_jobs(state, MAX_JOBS_OF_STATE).await?
+        {
+            return Ok(RowLead::State(state));
+        }
+        let limits = |of| self.filter.as_ref().map_or([None; 2], |filter| filter.limits(of));
+        let limits = ListLimits {
+            gamma: limits(NumberField::Gamma),
+            relative_volume: limits(NumberField::RelativeVolume),
+        };
+        match self.is_by_decision() && limits != ListLimits::default() {
+            true => Ok(RowLead::Limits(limits, store.newest_candidate().await?)),
+            false => Ok(RowLead::Order),
+        }
+    }
+
+    /// Whether rows that are read may be filtered out.
+    pub fn filters_rows(&self, lead: RowLead) -> bool {
+        let is_order = matches!(lead, RowLead::Order);
+        let by_fate = self.fate.is_some() && is_order && !self.is_by_decision();
+        let by_state = self.state.is_some() && is_order && self.order != TableOrder::Queue;
+        by_fate || by_state || self.filter.is_some()
+    }
+
+    /// At most `limit` rows.
+    pub async fn read(
+        &self,
+        store: &Store,
+        lead: RowLead,
+        after: Option<ListCursor>,
+        limit: u32,
+    ) -> Result<FoundRows, StoreError> {
+        // What was declined has no label job.
+        if self.state.is_some() && self.origin_and_reason().1.is_some() {
+            return Ok(FoundRows { rows: Vec::new(), searched: 0, next: None });
+        }
+        if let RowLead::Limits(limits, newest) = lead {
+            return self.read_within(store, limits, newest, after, limit).await;
+        }
+        let rows = self.read_in_order(store, lead, after, limit).await?;
+        let is_full = rows.len() == limit as usize;
+        let next = rows.last().filter(|_| is_full).map(|last| self.cursor_of(last));
+        Ok(FoundRows { searched: rows.len(), rows, next })
+    }
+
+    async fn read_in_order(
+        &self,
+        store: &Store,
+        lead: RowLead,
+        after: Option<ListCursor>,
+        limit: u32,
+    ) -> Result<Vec<ListedCandidate>, StoreError> {
+        let (descending, decision) = (self.is_descending(), after.map(|place| place.decision));
+        let order = match self.order {
+            TableOrder::Gamma => ListOrder::Gamma,
+            TableOrder::RelativeVolume => ListOrder::Volume,
+            TableOrder::Decision | TableOrder::Queue | TableOrder::Column(_) => ListOrder::Decision,
+        };
+        let (origin, reason) = self.origin_and_reason();
+        match (lead, self.state, self.only_walk(), origin) {
+            (RowLead::State(state), ..) => {
+                store.list_state(state, origin, (order, descending), after, limit).await
+            }
+            (_, Some(state), ..) if self.order == TableOrder::Queue => {
+                store.list_queue(state, after, limit).await
+            }
+            (_, _, Some(walk), _) if self.is_by_decision() => {
+                store.list_decided_of_walk(walk, descending, decision, limit).await
+            }
+            (.., Some(origin)) if self.is_by_decision() => {
+                store.list_fate(origin, reason, descending, decision, limit).await
+            }
+            _ => store.list_candidates(order, descending, after, limit).await,
+        }
+    }
+
+    /// Rows within limits, of the next decisions.
+    async fn read_within(
+        &self,
+        store: &Store,
+        limits: ListLimits,
+        newest: i64,
+        after: Option<ListCursor>,
+        limit: u32,
+    ) -> Result<FoundRows, StoreError> {
+        let (descending, after) = (self.is_descending(), after.map(|place| place.decision));
+        let decisions = match descending {
+            true => {
+                let end = after.unwrap_or(newest + 1).min(newest + 1);
+                (end - SEARCHED_DECISIONS).max(1)..end
+            }
+            false => {
+                let begin = after.map_or(1, |after| after + 1);
+                begin..(begin + SEARCHED_DECISIONS).min(newest + 1)
+            }
+        };
+        let (origin, reason) = self.origin_and_reason();
+        let fate = origin.map(|origin| (origin, reason));
+        let rows = store.list_within(decisions.clone(), limits, fate, descending, limit).await?;
+        let (first, last) = (decisions.start, decisions.end - 1);
+        let (reached, is_end) = match rows.last().filter(|_| rows.len() == limit as usize) {
+            Some(row) => (row.decision, false),
+            None if descending => (first, first <= 1),
+            None => (last, last >= newest),
+        };
+        let searched = if descending { decisions.end - reached } else { reached + 1 - first };
+        let next = (!is_end).then_some(ListCursor { priority: 0, value: 0.0, decision: reached });
+        Ok(FoundRows { rows, searched: searched.max(0) as usize, next })
+    }
+
+    /// Where the rows behind a row begin.
+    pub fn cursor_of(&self, row: &ListedCandidate) -> ListCursor {
+        let value = match self.order {
+            TableOrder::Decision | TableOrder::Column(_) => None,
+            TableOrder::Gamma => row.gamma,
+            TableOrder::RelativeVolume => row.relative_volume,
+            TableOrder::Queue => Some(row.value.unwrap_or(NO_LABEL_VALUE)),
+        };
+        let priority = row.priority.unwrap_or_default();
+        ListCursor { priority, value: value.unwrap_or_default(), decision: row.decision }
+    }
+
+    /// Whether rows are read in the order of the decisions.
+    fn is_by_decision(&self) -> bool {
+        matches!(self.order, TableOrder::Decision | TableOrder::Column(_))
+    }
+
+    /// By a column, the newest are sorted.
+    fn is_descending(&self) -> bool {
+        !self.ascending || matches!(self.order, TableOrder::Column(_))
+    }
+
+    /// The origin and the reason of the decline that a fate stands for.
+    fn origin_and_reason(&self) -> (Option<&str>, Option<&str>) {
+        match self.fate.as_deref() {
+            None => (None, None),
+            Some("control") => (Some("control"), None),
+            Some("accepted") => (Some("biased"), None),
+            Some(reason) => (Some("biased"), Some(reason)),
+        }
+    }
+
+    /// The only walk whose candidates can match.
+    fn only_walk(&self) -> Option<u32> {
+        self.filter.as_ref().and_then(StructureFilter::only_walk)
+    }
+}
