@@ -82,7 +82,7 @@ pub enum PlantedBug {
     NodeFailuresCounted,
     /// Each attempt begins with the first adjustments again.
     LadderRestarted,
-    /// A labeller forgets that a number of a submission was refused, and may have a job all the same.
+    /// A labeller uses the number of a submission that was refused, and may have a job all the same, once more.
     RefusalForgotten,
     /// A labeller removes every directory that another one left, whether its result is needed or not.
     WantedRemoved,

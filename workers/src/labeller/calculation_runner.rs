@@ -273,8 +273,8 @@ impl Calculation {
         }
     }
 
-    /// Waits until the program has ended or reaches a limit. Returns the limit, if any, and the largest observed
-    /// memory.
+    /// Waits until the program has ended or reaches a limit, or until the directory of the calculation is removed. Returns why the program
+    /// must end, if it must, and the largest observed memory.
     fn wait(
         &self,
         program: Pid,
@@ -293,6 +293,11 @@ impl Calculation {
                 return Ok((None, most));
             }
             children.reap()?;
+            // Nobody can read its results any more.
+            let found = self.directory.symlink_metadata();
+            if found.is_err_and(|error| error.kind() == ErrorKind::NotFound) {
+                return Ok((Some(Exit::LostNode), most));
+            }
             if let Some(limit) = self.memory_limit {
                 most = most.max(process_tree::memory());
                 if most > limit {

@@ -76,7 +76,7 @@ pub mod decisions {
     pub use super::calculation_state::{CalculationState, EarlierStep, WaitStep};
     pub use super::custom_jobs::{
         AfterFailure, CustomDirectory, CustomInspection, CustomStep, CustomSubmission, JobSubmission,
-        MAX_SUBMISSIONS, SubmissionFailure, infer_custom_end,
+        MAX_NUMBER, MAX_SUBMISSIONS, SubmissionFailure, infer_custom_end,
     };
     pub use super::failure_classes::failure_classes;
     pub use super::retry_decision::{attempt_limit, counts_as_attempt, failure_at, next_adjustments};

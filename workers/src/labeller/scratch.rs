@@ -163,8 +163,8 @@ async fn cleanup_one(
     Ok(())
 }
 
-/// Whether the directory of a calculation may be removed that no labeller waits for. `state` is `None` if its creator was killed
-/// before anything started.
+/// Whether a labeller that starts may remove this directory: its result is not wanted, and as far as is known nothing runs there.
+/// `state` is `None` if the store knows no calculation in this directory, usually because its creator was killed before anything started.
 pub fn is_left_over(past: &PastCalculation, state: Option<&CalculationState>) -> bool {
     !past.wanted && state != Some(&CalculationState::Running)
 }

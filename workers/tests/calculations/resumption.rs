@@ -162,3 +162,15 @@ async fn a_calculation_whose_result_is_not_needed_is_ended() {
     assert_eq!((labels.len(), labels[0].label.energy), (1, -1.0));
     fixture.nothing_is_left();
 }
+
+/// Such as after its directory was given up on another host.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_calculation_whose_directory_is_removed_ends() {
+    let fixture = Fixture::new(1, WITH_CHILDREN).await;
+    let labeller = fixture.labeller().await;
+    fixture.wait_until_begun(1).await;
+    until("its children do not start", async || fixture.processes().len() >= 3).await;
+    labeller.kill(&fixture).await;
+    fixture.directories().iter().for_each(|directory| fs::remove_dir_all(directory).unwrap());
+    until("its processes do not end", async || fixture.processes().is_empty()).await;
+}

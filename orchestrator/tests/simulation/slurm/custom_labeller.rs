@@ -55,6 +55,10 @@ impl LabellerIo {
                     self.files.borrow_mut().record_inferred(name, end.clone());
                     return CalculationState::Ended(end);
                 }
+                CustomStep::Close => {
+                    let closed = self.files.borrow_mut().close(name);
+                    return if closed { CalculationState::Gone } else { CalculationState::Running };
+                }
                 CustomStep::Is(state) => return state,
             };
         }
@@ -73,7 +77,7 @@ impl LabellerIo {
     pub(super) async fn submit_custom(&self, dialect: &Dialect, name: &str) -> Failing<()> {
         let mut submission = CustomSubmission::default();
         loop {
-            let number = self.files.borrow_mut().begin_submission(name);
+            let number = self.files.borrow_mut().begin_submission(name, self.bug);
             let Some(number) = number else { return Err(format!("no submission of {name} is left")) };
             let failure = match self.try_to_submit(dialect, name, number).await {
                 Ok(id) => {
@@ -128,6 +132,9 @@ impl LabellerIo {
                         self.submit_custom(dialect, name).await?;
                     }
                     WaitStep::Wait => {}
+                    WaitStep::Abandon if self.files.borrow().is_closed(name) => {
+                        return Err(format!("no submission of {name} is left"));
+                    }
                     WaitStep::Abandon => return Ok(None),
                 }
                 asked = self.now();

@@ -7,7 +7,7 @@ use std::time::Duration;
 use batch::JobId;
 use dft::{FailureClass, RetryAdjustment};
 use workers::labeller::decisions::{
-    CalculationEnd, CustomDirectory, JobDirectory, JobSubmission, MAX_SUBMISSIONS, Traces,
+    CalculationEnd, CustomDirectory, JobDirectory, JobSubmission, MAX_NUMBER, MAX_SUBMISSIONS, Traces,
 };
 
 use super::super::fault::Time;
@@ -33,6 +33,8 @@ pub struct CalculationFiles {
     pub submissions: BTreeMap<u32, (Option<JobId>, Time)>,
     /// Numbers of submissions that were refused.
     pub refused: BTreeSet<u32>,
+    /// No job may calculate any more.
+    pub is_closed: bool,
     /// The recorded end, when it was recorded, and when labellers see it.
     pub end: Option<(CalculationEnd, Time, Time)>,
     /// Slurm's log, with the time of its last entry.
@@ -49,6 +51,16 @@ pub struct CalculationFiles {
     pub is_delivered: bool,
     /// Its job is over, when a labeller cleaned up.
     pub is_unwanted: bool,
+}
+
+impl CalculationFiles {
+    /// The number of a further submission, if there may be one.
+    fn free_number(&self, bug: Option<PlantedBug>) -> Option<u32> {
+        let forgets = bug == Some(PlantedBug::RefusalForgotten);
+        let is_used =
+            |number: &u32| self.submissions.contains_key(number) || !forgets && self.refused.contains(number);
+        (1..=MAX_NUMBER).find(|number| !is_used(number)).filter(|_| self.submissions.len() < MAX_SUBMISSIONS)
+    }
 }
 
 /// Why a directory is removed.
@@ -98,17 +110,29 @@ impl SharedFiles {
         }
         let age = |time: Time| Duration::from_millis(self.now.saturating_sub(time));
         let begun = found.begun.filter(|(_, seen)| *seen <= self.now);
-        let forgets = bug == Some(PlantedBug::RefusalForgotten);
         let submissions = found.submissions.iter().map(|(number, (id, time))| JobSubmission {
             number: *number,
             id: id.clone(),
             age: age(*time),
-            was_refused: found.refused.contains(number) && !forgets,
         });
         CustomDirectory::Open {
             begun: begun.map(|(time, _)| (found.begun_by, age(time))),
             submissions: submissions.collect(),
+            may_be_submitted: found.free_number(bug).is_some(),
         }
+    }
+
+    /// Keeps every job from calculating; `false` if one has begun.
+    pub fn close(&mut self, name: &str) -> bool {
+        let found = self.directories.get_mut(name).filter(|found| !found.is_removed);
+        found.is_none_or(|found| {
+            found.is_closed = found.begun.is_none();
+            found.is_closed
+        })
+    }
+
+    pub fn is_closed(&self, name: &str) -> bool {
+        self.directories.get(name).is_some_and(|found| found.is_closed && !found.is_removed)
     }
 
     /// The recorded end, if labellers see it.
@@ -118,9 +142,9 @@ impl SharedFiles {
     }
 
     /// Notes a submission before it is made; `None` if there were too many, or there is no directory.
-    pub fn begin_submission(&mut self, name: &str) -> Option<u32> {
+    pub fn begin_submission(&mut self, name: &str, bug: Option<PlantedBug>) -> Option<u32> {
         let found = self.directories.get_mut(name).filter(|found| !found.is_removed)?;
-        let number = (1..=MAX_SUBMISSIONS).find(|number| !found.submissions.contains_key(number))?;
+        let number = found.free_number(bug)?;
         found.submissions.insert(number, (None, self.now));
         Some(number)
     }
@@ -200,19 +224,15 @@ impl SharedFiles {
         if std::mem::replace(&mut found.is_removed, true) || found.is_damaged {
             return;
         }
-        // A job whose id was lost cannot be cancelled. What it computes is lost with its directory.
-        if matches!(why, DirectoryRemoval::Lost { .. })
-            && found.submissions.values().any(|(id, _)| id.is_none())
-        {
-            found.is_running = false;
-            return;
-        }
         let has_result = found.truth.is_some_and(|truth| truth != Err(FailureClass::NodeFailure));
         let is_left = has_result && !found.is_delivered;
         let is_needed = match why {
             DirectoryRemoval::NotNeeded | DirectoryRemoval::OtherProgram => return,
-            // What runs is cancelled, if its id is known.
-            DirectoryRemoval::Lost { has_newer: true } => return,
+            // What runs was cancelled, or ends without its directory.
+            DirectoryRemoval::Lost { has_newer: true } => {
+                found.is_running = false;
+                return;
+            }
             DirectoryRemoval::LeftOver => found.is_running || is_left && !found.is_unwanted,
             DirectoryRemoval::Delivered | DirectoryRemoval::Lost { has_newer: false } => {
                 found.is_running || is_left

@@ -312,7 +312,7 @@ impl World {
         let found = files.directories.get_mut(&name).expect("it was submitted from there");
         let job = self.slurm.job(id);
         (job.node, job.begun) = (node, now);
-        if found.is_removed || found.begun.is_some() {
+        if found.is_removed || found.is_closed || found.begun.is_some() {
             job.state = if found.is_removed { "FAILED" } else { "COMPLETED" };
             job.ended = Some(now);
             return self.tell(format!("job {id} does nothing"));

@@ -34,7 +34,7 @@ pub fn infer_custom_end(
     };
     let name = &scheduler.name;
     let mut remark = match (id, state) {
-        (None, _) => format!("its job was submitted to {name}, whose answer was lost"),
+        (None, _) => format!("the id of its job at {name} is unknown, and its time limit is over"),
         (Some(id), PolledState::Vanished) => format!("{name} no longer knows its job {id}"),
         (Some(id), state) => format!("{name} reports: job {id} is {}", state.name()),
     };
@@ -109,6 +109,6 @@ mod tests {
         }
         let remark =
             infer_custom_end(&scheduler, None, PolledState::Vanished, &traces(&job, 1)).remark.unwrap();
-        assert!(remark.starts_with("its job was submitted to PBS, whose answer was lost"), "{remark}");
+        assert!(remark.starts_with("the id of its job at PBS is unknown"), "{remark}");
     }
 }

@@ -10,10 +10,10 @@ use ::batch::{JobId, PolledState};
 
 use super::super::calculation_runner::CalculationEnd;
 use super::super::calculation_state::CalculationState;
-use super::job::{JobSubmission, MAX_SUBMISSIONS};
+use super::job::JobSubmission;
 
 /// A batch system may not know a job for this long after it was submitted.
-const NOT_YET_KNOWN: Duration = Duration::from_secs(60);
+pub(super) const NOT_YET_KNOWN: Duration = Duration::from_secs(60);
 /// A job whose id was lost is over this long after its time limit.
 const LOST_MARGIN: Duration = Duration::from_secs(600);
 
@@ -30,8 +30,10 @@ pub enum CustomDirectory {
     Open {
         /// The submission that calculates, and the time since it began.
         begun: Option<(u32, Duration)>,
-        /// The submissions so far.
+        /// The submissions so far that were not refused.
         submissions: Vec<JobSubmission>,
+        /// Whether there may be a further submission.
+        may_be_submitted: bool,
     },
 }
 
@@ -44,7 +46,7 @@ pub struct CustomInspection {
     begun: Option<u32>,
     /// Submissions whose states are not known yet; the first of them was asked for.
     unknown: VecDeque<JobSubmission>,
-    /// The last answer: id and state of a job that is over.
+    /// The job of which an end may be inferred, and its state; there when nothing is left to ask.
     over: Option<(Option<JobId>, PolledState)>,
 }
 
@@ -55,7 +57,7 @@ pub enum CustomStep {
     Ask(JobId),
     /// Make files from other hosts visible, and look at the directory again.
     Settle,
-    /// The submission with this number is over, and its runner recorded no end: infer it ([`super::infer_end`]).
+    /// The submission with this number is over, and its runner recorded no end: infer it ([`super::infer_custom_end`]).
     InferEnd {
         /// Number of the submission that calculated.
         number: u32,
@@ -64,6 +66,9 @@ pub enum CustomStep {
         /// What the batch system says of it.
         state: PolledState,
     },
+    /// No submission is left: keep the jobs of lost ids, which may still wait, from calculating. The calculation is gone, or runs if
+    /// one of them has begun.
+    Close,
     /// The state of the calculation.
     Is(CalculationState),
 }
@@ -76,11 +81,13 @@ impl CustomInspection {
 
     /// Continues with what a look at the directory shows.
     pub fn looked(&mut self, found: CustomDirectory) -> CustomStep {
-        let (begun, submissions) = match found {
+        let (begun, submissions, may_be_submitted) = match found {
             CustomDirectory::Missing => return CustomStep::Is(CalculationState::Gone),
             CustomDirectory::Foreign => return CustomStep::Is(CalculationState::Elsewhere),
             CustomDirectory::Ended(end) => return CustomStep::Is(CalculationState::Ended(end)),
-            CustomDirectory::Open { begun, submissions } => (begun, submissions),
+            CustomDirectory::Open { begun, submissions, may_be_submitted } => {
+                (begun, submissions, may_be_submitted)
+            }
         };
         match self.over.take() {
             None => self.looked_first(begun, submissions),
@@ -88,11 +95,8 @@ impl CustomInspection {
                 (Some(number), _) => CustomStep::InferEnd { number, id, state },
                 // It has begun meanwhile: the next inspection knows more.
                 (None, Some(_)) => CustomStep::Is(CalculationState::Running),
-                // None is left: only a new calculation, in another directory, can be submitted.
-                (None, None) if submissions.len() >= MAX_SUBMISSIONS as usize => {
-                    CustomStep::Is(CalculationState::Gone)
-                }
-                (None, None) => CustomStep::Is(CalculationState::Ready),
+                (None, None) if may_be_submitted => CustomStep::Is(CalculationState::Ready),
+                (None, None) => CustomStep::Close,
             },
         }
     }
@@ -105,15 +109,14 @@ impl CustomInspection {
         self.begun = begun.map(|(number, _)| number);
         let Some((number, age)) = begun else {
             self.unknown = submissions.into_iter().filter(|submission| submission.id.is_some()).collect();
-            return self.ask_next(PolledState::Vanished);
+            return self.ask_next();
         };
+        // A submission that was refused, although there is a job, is not among them.
         let submission = submissions.into_iter().find(|submission| submission.number == number);
-        // Under a number that was refused before, another job may calculate than the one with this id.
-        let known = |submission: &JobSubmission| submission.id.is_some() && !submission.was_refused;
-        match submission.filter(known) {
+        match submission.filter(|submission| submission.id.is_some()) {
             Some(submission) => {
                 self.unknown.push_back(submission);
-                self.ask_next(PolledState::Vanished)
+                self.ask_next()
             }
             None if age < self.time_limit.saturating_add(LOST_MARGIN) => {
                 CustomStep::Is(CalculationState::Running)
@@ -133,15 +136,15 @@ impl CustomInspection {
             return CustomStep::Is(CalculationState::Running);
         }
         self.over = Some((submission.id, state));
-        self.ask_next(state)
+        self.ask_next()
     }
 
     /// Asks for the next job, or looks again if all are over.
-    fn ask_next(&mut self, last: PolledState) -> CustomStep {
+    fn ask_next(&mut self) -> CustomStep {
         match self.unknown.front().and_then(|submission| submission.id.clone()) {
             Some(id) => CustomStep::Ask(id),
             None => {
-                self.over.get_or_insert((None, last));
+                self.over.get_or_insert((None, PolledState::Vanished));
                 CustomStep::Settle
             }
         }
@@ -162,12 +165,12 @@ mod tests {
 
     fn submission(number: u32, id: Option<u64>, age: u64) -> JobSubmission {
         let (id, age) = (id.map(JobId::from), Duration::from_secs(age));
-        JobSubmission { number, id, age, was_refused: false }
+        JobSubmission { number, id, age }
     }
 
     fn open(begun: Option<(u32, u64)>, submissions: &[JobSubmission]) -> CustomDirectory {
         let begun = begun.map(|(number, age)| (number, Duration::from_secs(age)));
-        CustomDirectory::Open { begun, submissions: submissions.to_vec() }
+        CustomDirectory::Open { begun, submissions: submissions.to_vec(), may_be_submitted: true }
     }
 
     fn end() -> CalculationEnd {
@@ -213,10 +216,8 @@ mod tests {
             assert_eq!(begun(state, CustomDirectory::Ended(end())), CustomStep::Is(Ended(end())));
             assert_eq!(begun(state, CustomDirectory::Missing), CustomStep::Is(Gone));
         }
-        // Its id was lost, its submission was refused although there was a job, or its number was used again then.
-        let refused = JobSubmission { was_refused: true, ..submission(5, Some(9), 60) };
-        let all = [all.as_slice(), &[refused]].concat();
-        for number in [3, 4, 5] {
+        // Its id was lost, or its submission was refused although there was a job.
+        for number in [3, 4] {
             let lost = |age| inspect(open(Some((number, age)), &all), &[], open(Some((number, age)), &all));
             assert_eq!(lost(699), CustomStep::Is(Running));
             let inferred = CustomStep::InferEnd { number, id: None, state: Vanished };
@@ -234,9 +235,11 @@ mod tests {
         assert_eq!(waiting(&[Completed, Pending], open(None, &all)), CustomStep::Is(Running));
         assert_eq!(waiting(&[Completed, Completed], open(Some((2, 0)), &all)), CustomStep::Is(Running));
         assert_eq!(inspect(open(None, &[]), &[], open(None, &[])), CustomStep::Is(Ready));
-        let four = [1, 2, 3, 4].map(|number| submission(number, None, 90));
-        assert_eq!(inspect(open(None, &four), &[], open(None, &four)), CustomStep::Is(Gone));
-        assert_eq!(inspect(open(None, &four[..3]), &[], open(None, &four[..3])), CustomStep::Is(Ready));
+        let used_up =
+            |begun| CustomDirectory::Open { begun, submissions: Vec::new(), may_be_submitted: false };
+        assert_eq!(inspect(used_up(None), &[], used_up(None)), CustomStep::Close);
+        let has_begun = Some((2, Duration::ZERO));
+        assert_eq!(inspect(used_up(None), &[], used_up(has_begun)), CustomStep::Is(Running));
         // The batch system may not know it yet.
         let young = [submission(1, Some(7), 59)];
         assert_eq!(inspect(open(None, &young), &[Vanished], open(None, &young)), CustomStep::Is(Running));

@@ -11,9 +11,13 @@ use serde::{Deserialize, Serialize};
 
 /// A link that the job that calculates creates; it leads to the number of its submission.
 pub(super) const BEGUN: &str = "begun";
-/// Largest number of submissions of a calculation: a job may be submitted twice if an answer is lost, and again after it was cancelled
-/// before it began.
-pub const MAX_SUBMISSIONS: u32 = 4;
+/// Where the link leads when no job may calculate any more.
+const CLOSED: &str = "none";
+/// Largest number of submissions of a calculation that were not refused: a job may be submitted twice if an answer is lost, and again
+/// after it was cancelled before it began.
+pub const MAX_SUBMISSIONS: usize = 4;
+/// Submissions have numbers from 1 to this, those that were refused too.
+pub const MAX_NUMBER: u32 = 12;
 
 /// Identifies the job of a calculation.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -36,9 +40,6 @@ pub struct JobSubmission {
     pub id: Option<JobId>,
     /// Time since it was submitted.
     pub age: Duration,
-    /// The batch system refused an earlier submission with this number. If it has a job all the same, that one may
-    /// calculate under this number.
-    pub was_refused: bool,
 }
 
 impl CustomJob {
@@ -60,9 +61,9 @@ impl CustomJob {
         Some((number, time.elapsed().unwrap_or_default()))
     }
 
-    /// The submissions so far.
+    /// The submissions so far that were not refused.
     pub(super) fn submissions(&self) -> Vec<JobSubmission> {
-        (1..=MAX_SUBMISSIONS).filter_map(|number| self.submission(number)).collect()
+        (1..=MAX_NUMBER).filter_map(|number| self.submission(number)).collect()
     }
 
     fn submission(&self, number: u32) -> Option<JobSubmission> {
@@ -70,13 +71,28 @@ impl CustomJob {
         let time = fs::symlink_metadata(&path).and_then(|file| file.modified()).ok()?;
         let text = result_file::read(&path).ok().and_then(|bytes| String::from_utf8(bytes).ok());
         let id = text.and_then(|text| JobId::at_start_of(&text));
-        let was_refused = self.refusal(number).symlink_metadata().is_ok();
-        Some(JobSubmission { number, id, age: time.elapsed().unwrap_or_default(), was_refused })
+        Some(JobSubmission { number, id, age: time.elapsed().unwrap_or_default() })
+    }
+
+    /// Whether there may be a further submission.
+    pub(super) fn may_be_submitted(&self) -> bool {
+        self.submissions().len() < MAX_SUBMISSIONS && self.free_numbers().next().is_some()
+    }
+
+    /// Numbers that no submission has had. That of a refused one is not used again: if there is a job all the same, it may
+    /// calculate under this number.
+    fn free_numbers(&self) -> impl Iterator<Item = u32> {
+        let is_there = |path: PathBuf| path.symlink_metadata().is_ok();
+        (1..=MAX_NUMBER)
+            .filter(move |number| !is_there(self.refusal(*number)) && !is_there(self.note(*number)))
     }
 
     /// Notes a submission before it is made; `None` if there were too many.
     pub fn begin_submission(&self) -> io::Result<Option<u32>> {
-        for number in 1..=MAX_SUBMISSIONS {
+        if !self.may_be_submitted() {
+            return Ok(None);
+        }
+        for number in self.free_numbers() {
             match File::create_new(self.note(number)) {
                 Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
                 created => return created.map(|_| Some(number)),
@@ -90,7 +106,20 @@ impl CustomJob {
         File::options().write(true).open(self.note(number))?.write_all(id.as_str().as_bytes())
     }
 
-    /// Forgets a submission that the batch system refused, so that its number is free. That it was refused stays known.
+    /// Keeps every job from calculating. Returns `false` if one has begun.
+    pub fn close(&self) -> io::Result<bool> {
+        match std::os::unix::fs::symlink(CLOSED, self.directory.join(BEGUN)) {
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => Ok(self.is_closed()),
+            closed => closed.map(|()| true),
+        }
+    }
+
+    /// Whether no job may calculate any more.
+    pub fn is_closed(&self) -> bool {
+        fs::read_link(self.directory.join(BEGUN)).is_ok_and(|target| target == Path::new(CLOSED))
+    }
+
+    /// Notes that the batch system refused a submission. It no longer counts, and its number is not used again.
     pub fn forget_submission(&self, number: u32) -> io::Result<()> {
         File::create(self.refusal(number))?;
         fs::remove_file(self.note(number))
@@ -133,9 +162,13 @@ mod tests {
         assert_eq!(found, [(1, None), (2, Some(JobId::from(7)))]);
         job.forget_submission(1).unwrap();
         let numbers: Vec<_> = (0..4).map(|_| job.begin_submission().unwrap()).collect();
-        assert_eq!(numbers, [Some(1), Some(3), Some(4), None]);
-        let refused: Vec<_> = job.submissions().into_iter().map(|one| one.was_refused).collect();
-        assert_eq!(refused, [true, false, false, false]);
+        assert_eq!(numbers, [Some(3), Some(4), Some(5), None]);
+        (3..=5).for_each(|number| job.forget_submission(number).unwrap());
+        for number in 6..=MAX_NUMBER {
+            assert_eq!(job.begin_submission().unwrap(), Some(number));
+            job.forget_submission(number).unwrap();
+        }
+        assert_eq!((job.begin_submission().unwrap(), job.submissions().len()), (None, 1));
         assert_eq!(job.begun(), None);
         std::os::unix::fs::symlink("3", home.path().join(BEGUN)).unwrap();
         assert_eq!(job.begun().map(|(number, _)| number), Some(3));

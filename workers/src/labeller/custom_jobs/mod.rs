@@ -33,9 +33,10 @@ use super::file_error::file_error;
 use super::private_directory;
 
 pub use end::infer_custom_end;
+use inspection::NOT_YET_KNOWN;
 pub use inspection::{CustomDirectory, CustomInspection, CustomStep};
 pub(super) use job::CustomJob;
-pub use job::{JobSubmission, MAX_SUBMISSIONS};
+pub use job::{JobSubmission, MAX_NUMBER, MAX_SUBMISSIONS};
 pub use submission::{AfterFailure, CustomSubmission, SubmissionFailure};
 
 /// Time between two questions to the batch system about a job.
@@ -75,9 +76,7 @@ impl CustomJobs {
         let mut submission = CustomSubmission::default();
         loop {
             let Some(number) = job.begin_submission().map_err(failed)? else {
-                let why =
-                    format!("its {MAX_SUBMISSIONS} jobs ended before they began, or {SCRATCH_NOT_SHARED}");
-                return Err(job_error(job, why));
+                return Err(no_submission_left(job));
             };
             let on_full = |full: &CustomError| {
                 if !self.is_full.swap(true, Ordering::Relaxed) {
@@ -119,13 +118,17 @@ impl CustomJobs {
                     end.write(&job.directory).map_err(|error| file_error(&job.directory, error))?;
                     return Ok(CalculationState::Ended(end));
                 }
+                CustomStep::Close => {
+                    let closed = job.close().map_err(|error| file_error(&job.directory, error))?;
+                    return Ok(if closed { CalculationState::Gone } else { CalculationState::Running });
+                }
                 CustomStep::Is(state) => return Ok(state),
             };
         }
     }
 
     fn look(&self, job: &CustomJob) -> CustomDirectory {
-        match look_without(job) {
+        match look_at_directory(job) {
             CustomDirectory::Open { .. } if job.scheduler != self.client.scheduler().name => {
                 CustomDirectory::Foreign
             }
@@ -133,7 +136,8 @@ impl CustomJobs {
         }
     }
 
-    /// Waits for the end, and submits the job if it is over before it began; `None` if its directory was removed.
+    /// Waits for the end, and submits the job if it is over before it began; `None` if its directory was removed. If no submission is left,
+    /// the labeller fails, and the next one begins a new calculation.
     pub async fn wait(&self, job: &CustomJob) -> Result<Option<CalculationEnd>, StoreError> {
         let (mut pause, mut asked) = (MIN_POLL_INTERVAL, Instant::now());
         loop {
@@ -145,6 +149,7 @@ impl CustomJobs {
                     WaitStep::Read(end) => return Ok(Some(end)),
                     WaitStep::Submit => self.submit(job).await?,
                     WaitStep::Wait => {}
+                    WaitStep::Abandon if job.is_closed() => return Err(no_submission_left(job)),
                     WaitStep::Abandon => return Ok(None),
                 }
                 asked = Instant::now();
@@ -159,8 +164,10 @@ impl CustomJobs {
     pub async fn cancel(&self, job: &CustomJob) -> Result<(), StoreError> {
         let failed = |error: CustomError| job_error(job, error);
         let mut living = Vec::new();
-        for id in job.submissions().into_iter().filter_map(|submission| submission.id) {
-            if self.client.poll(&id).await.map_err(failed)?.is_alive() {
+        for JobSubmission { id, age, .. } in job.submissions() {
+            let Some(id) = id else { continue };
+            let state = self.client.poll(&id).await.map_err(failed)?;
+            if state.is_alive() || state == PolledState::Vanished && age < NOT_YET_KNOWN {
                 self.client.cancel(&id).await.map_err(failed)?;
                 living.push(id);
             }
@@ -191,7 +198,7 @@ impl CustomJobs {
 
 /// The state as far as it can be known without the batch system.
 pub(super) fn poll_directory(job: &CustomJob) -> Option<CalculationState> {
-    match look_without(job) {
+    match look_at_directory(job) {
         CustomDirectory::Missing => Some(CalculationState::Gone),
         CustomDirectory::Foreign => Some(CalculationState::Elsewhere),
         CustomDirectory::Ended(end) => Some(CalculationState::Ended(end)),
@@ -200,7 +207,7 @@ pub(super) fn poll_directory(job: &CustomJob) -> Option<CalculationState> {
 }
 
 /// What the directory shows, whichever batch system there is now.
-fn look_without(job: &CustomJob) -> CustomDirectory {
+fn look_at_directory(job: &CustomJob) -> CustomDirectory {
     let exists = job.directory.symlink_metadata().is_ok();
     if exists && !private_directory::is_own(&job.directory) {
         // Another user has created a directory of that name after it was removed, or has submitted the job.
@@ -211,9 +218,21 @@ fn look_without(job: &CustomJob) -> CustomDirectory {
     }
     match exists {
         _ if job.user != own_user() => CustomDirectory::Foreign,
-        true => CustomDirectory::Open { begun: job.begun(), submissions: job.submissions() },
+        true => CustomDirectory::Open {
+            begun: job.begun(),
+            submissions: job.submissions(),
+            may_be_submitted: job.may_be_submitted(),
+        },
         false => CustomDirectory::Missing,
     }
+}
+
+fn no_submission_left(job: &CustomJob) -> StoreError {
+    let why = format!(
+        "none of its {MAX_SUBMISSIONS} submissions has begun: their jobs ended before, {} did not answer, or {SCRATCH_NOT_SHARED}",
+        job.scheduler
+    );
+    job_error(job, why)
 }
 
 fn job_error(job: &CustomJob, why: impl ToString) -> StoreError {

@@ -9,7 +9,7 @@ use ::batch::{CustomClient, JobRequest, quoted};
 
 use super::super::calculation_runner::{self, Calculation, NODE_VARIABLE, RunnerRequest};
 use super::super::slurm::runner;
-use super::job::{self, BEGUN, MAX_SUBMISSIONS};
+use super::job::{self, BEGUN, MAX_NUMBER};
 
 /// What each submission runs.
 const SCRIPT: &str = "run.sh";
@@ -33,7 +33,7 @@ pub(super) fn write(
 ) -> io::Result<()> {
     let directory = calculation.directory.clone();
     let run = quoted(&text(&directory.join(SCRIPT))?);
-    for number in 1..=MAX_SUBMISSIONS {
+    for number in 1..=MAX_NUMBER {
         let request = JobRequest {
             name: name(&directory),
             cores,
@@ -117,7 +117,7 @@ mod tests {
         };
         write(calculation, &CustomClient::new(scheduler, Duration::ZERO), 4, 2).unwrap();
         let here = home.path().display();
-        for number in 1..=MAX_SUBMISSIONS {
+        for number in 1..=MAX_NUMBER {
             let script = fs::read_to_string(job::script(home.path(), number)).unwrap();
             let expected = format!(
                 "#J -n 4 -g 2 -m 1908 -t 61 -o {here}/submission-{number}.log\nsh {here}/run.sh {number}\n"

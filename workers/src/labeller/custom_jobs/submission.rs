@@ -13,7 +13,7 @@ pub enum SubmissionFailure {
     NoId,
     /// There is no such command.
     NoCommand,
-    /// The command failed.
+    /// The command failed, or could not be started.
     Refused,
 }
 
@@ -27,7 +27,8 @@ pub struct CustomSubmission {
 /// What follows from a submission that failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct AfterFailure {
-    /// The note of the submission is removed: there is no job.
+    /// The submission counts as refused. If there is a job all the same, it may calculate under the number of this submission, which
+    /// is not used again.
     pub forget: bool,
     /// The job is submitted again; otherwise the labeller fails.
     pub again: bool,
