@@ -146,8 +146,8 @@ impl StructureFilter {
         }
     }
 
-    /// What a property of a structure that passes the filter is at least and at most; `None` without a limit, and with a limit
-    /// the property is there.
+    /// Limits that follow from the filter, both inclusive: a structure that passes has this property, not below the first and not above
+    /// the second. `None`: no limit. The filter may be narrower.
     pub fn limits(&self, of: NumberField) -> [Option<f64>; 2] {
         use ComparisonOperator::{Above, AtLeast, AtMost, Below, Different, Equal};
         let both = |a: &Self, b: &Self| (a.limits(of), b.limits(of));

@@ -27,7 +27,8 @@ pub struct ListCursor {
     pub decision: i64,
 }
 
-/// Least and largest values of candidates that a page has; `None` without a limit, and with one the value is there.
+/// Least and largest values of the candidates of a page; `None` without a limit. A candidate without the value is outside of
+/// any limit.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ListLimits {
     /// Largest γ under the original mixture.

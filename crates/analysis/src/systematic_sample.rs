@@ -63,6 +63,17 @@ mod tests {
     use super::*;
 
     #[test]
+    fn items_are_kept_by_the_level_of_their_index() {
+        for room in [1, 7, 4096] {
+            let mut thinned = SystematicSample::new(room);
+            (0..100_000_u64).for_each(|k| thinned.add(k));
+            let from = |least: u8| (0..100_000).filter(move |k| mixed(*k).trailing_zeros() as u8 >= least);
+            assert!(thinned.items().copied().eq(from(thinned.least)));
+            assert!(from(thinned.least - 1).count() > room, "no more are dropped than must be");
+        }
+    }
+
+    #[test]
     fn a_short_stream_is_kept_whole() {
         let mut thinned = SystematicSample::new(100);
         (0..100).for_each(|k| thinned.add(k));

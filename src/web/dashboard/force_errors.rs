@@ -23,7 +23,7 @@ async fn compute(dashboard: Dashboard) -> Result<String, ApiError> {
     let none =
         || ApiError::new(StatusCode::NOT_FOUND, "the campaign has no label protocol, and so no labels");
     let protocol = store.protocol_in_force().await?.ok_or_else(none)?;
-    // Both read all labels, in different orders.
+    // Both read labels, in different orders, so that neither can use what the other has read.
     let bounds = tokio::spawn(read_bounds(dashboard.clone(), protocol.hash));
     let statistics = label_statistics::read(store, protocol.hash, None).await?;
     let bounds = bounds.await.map_err(failed)??.summary(statistics.version.unwrap_or(0));

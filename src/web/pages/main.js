@@ -34,10 +34,11 @@ function show() {
     if (PAGES[link.dataset.page] === current) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
   }
-  const failed = (error) => {
-    if (error.name !== "AbortError") content.append(element("p", { class: "wrong", role: "alert" }, error.message));
-  };
-  Promise.resolve(page.show(content, rest.join("/"), shown.signal)).catch(failed);
+  Promise.resolve(page.show(content, rest.join("/"), shown.signal)).catch((error) => showError(content, error));
+}
+
+function showError(content, error) {
+  if (error.name !== "AbortError") content.append(element("p", { class: "wrong", role: "alert" }, error.message));
 }
 
 function menu() {
@@ -85,6 +86,8 @@ document.querySelector(".skip").addEventListener("click", (event) => {
   event.preventDefault();
   document.getElementById("content").focus();
 });
+// Of what a button starts.
+addEventListener("unhandledrejection", (event) => showError(document.getElementById("content"), event.reason));
 addEventListener("hashchange", () => {
   show();
   document.getElementById("content").focus();

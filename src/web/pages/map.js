@@ -24,7 +24,8 @@ const GREY = "#8a8f98";
 export async function show(content, address, signal) {
   const chosen = new URLSearchParams(address);
   const again = element("button", { type: "button", onclick: () => load() }, "Recompute");
-  const place = element("div", {}, element("p", { role: "status" }, "Reading features …"));
+  const waiting = element("p", { role: "status" }, "Reading features …");
+  const place = element("div", {}, waiting);
   content.append(element("p", {}, "Each point is a structure that the campaign collected, at the features of its atoms of one element, along the two "
     + "directions of feature space in which training data and collected atoms together differ most. A point opens its structure. ", again), place);
   const load = async () => {
@@ -32,8 +33,7 @@ export async function show(content, address, signal) {
     try {
       draw(place, await fetchComputed("/api/map", signal), chosen);
     } catch (error) {
-      // There is nothing to wait for.
-      if (error.name !== "AbortError") place.replaceChildren();
+      waiting.remove();
       throw error;
     } finally {
       place.removeAttribute("aria-busy");

@@ -17,18 +17,17 @@ const BAR = 100;
 
 export async function show(content, chosen, signal) {
   const again = element("button", { type: "button", onclick: () => load() }, "Recompute");
-  const place = element("div", { role: "status" }, element("p", {}, "Reading the mixture …"));
+  const waiting = element("p", { role: "status" }, "Reading the mixture …");
+  const place = element("div", {}, waiting);
   content.append(element("p", {}, "The Gaussians that grade structures. An accepted structure widens those of its elements. ",
     "The eigenvalues λ of a covariance C relative to the initial one, C₀, measure how far it has moved. ", again), place);
   const load = async () => {
     place.setAttribute("aria-busy", "true");
     try {
       const mixture = await fetchComputed("/api/mixture", signal);
-      place.removeAttribute("role");
       place.replaceChildren(...shown(mixture, decodeURIComponent(chosen)));
     } catch (error) {
-      // Without the initial mixture there is nothing to wait for.
-      if (error.name !== "AbortError") place.replaceChildren();
+      waiting.remove();
       throw error;
     } finally {
       place.removeAttribute("aria-busy");

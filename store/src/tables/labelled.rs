@@ -63,16 +63,19 @@ pub(super) use labelled_candidates;
 pub(crate) const AFTER: &str = labelled_candidates!("> $2", " LIMIT $3");
 pub(crate) const OF_DECISIONS: &str = labelled_candidates!(concat!("IN ", decision_list!()), "");
 
-/// The index gives the failed jobs.
+/// The index gives the failed jobs: each page reads all of them, but only its own candidates.
 pub(crate) const FAILED: &str = concat!(
     "SELECT candidate.decision AS decision, original_checksum, original_grades, ",
     joined!(candidate),
-    " FROM job CROSS JOIN candidate ON candidate.structure = job.structure
-    CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
-    WHERE job.state = 'failed' AND job.protocol = $1 AND candidate.decision > $2
-    AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
-        AND label.protocol = job.protocol AND status = 'excluded')
-    ORDER BY candidate.decision LIMIT $3"
+    " FROM (SELECT candidate.decision AS found
+        FROM job CROSS JOIN candidate ON candidate.structure = job.structure
+        WHERE job.state = 'failed' AND job.protocol = $1 AND candidate.decision > $2
+        AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
+            AND label.protocol = job.protocol AND status = 'excluded')
+        ORDER BY candidate.decision LIMIT $3) AS page
+    CROSS JOIN candidate ON candidate.decision = page.found
+    CROSS JOIN candidate_data ON candidate_data.decision = page.found
+    ORDER BY candidate.decision"
 );
 
 impl Store {

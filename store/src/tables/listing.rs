@@ -1,5 +1,5 @@
 //! Pages of the candidate table. Each query reads an index from the first row of the page, so its cost does not
-//! depend on the number of rows; those of a state read the jobs that have it.
+//! depend on the number of rows; those of a state read the jobs that have it, those within limits a range of decisions.
 
 use std::ops::Range;
 

@@ -50,7 +50,7 @@ pub async fn extxyz(State(dashboard): State<Dashboard>, RawQuery(query): RawQuer
     if found.rows.len() > MAX_STRUCTURES || found.next.is_some() {
         let why = match found.rows.len() > MAX_STRUCTURES {
             true => format!("more than {MAX_STRUCTURES} structures match"),
-            false => format!("only {MAX_READ} candidates are searched for a file"),
+            false => format!("more than {MAX_READ} candidates would be read for this file"),
         };
         let what = "narrow the selection, or use calmwalk export --where on the host of the campaign";
         return Err(ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, format!("{why}: {what}")));

@@ -18,6 +18,7 @@ use wire::{WalkConditions, WalkId};
 
 use self::columns::TableRow;
 use self::query::{CandidateQuery, PagePlace, TableOrder};
+use self::rows::RowSource;
 use super::Dashboard;
 use super::response::{ApiResult, json};
 use crate::filter::{StructureProperties, species};
@@ -26,8 +27,8 @@ use crate::filter::{StructureProperties, species};
 const MAX_PAGE_ROWS: u32 = 200;
 const DEFAULT_ROWS: u32 = 50;
 /// Candidates read at a time when rows are filtered, and the largest number read for a response.
-const SCAN_ROWS: u32 = 1000;
-const MAX_SCANNED: usize = 10_000;
+const READ_ROWS: u32 = 1000;
+const MAX_READ: usize = 10_000;
 /// The largest number searched for a response, where the store reads only those within limits.
 const MAX_SEARCHED: usize = 500_000;
 
@@ -75,7 +76,7 @@ impl CandidateQuery {
     /// A page in an order that has an index.
     async fn page(&self, store: &Store) -> Result<CandidatePage, StoreError> {
         let limit = self.limit.unwrap_or(DEFAULT_ROWS);
-        self.collect(store, self.cursor(), limit as usize, (MAX_SCANNED, MAX_SEARCHED)).await
+        self.collect(store, self.cursor(), limit as usize, (MAX_READ, MAX_SEARCHED)).await
     }
 
     /// At most `limit` matching rows behind a cursor, in an order that has an index. Ends after a number of candidates that were read,
@@ -87,8 +88,13 @@ impl CandidateQuery {
         limit: usize,
         (max_read, max_searched): (usize, usize),
     ) -> Result<CandidatePage, StoreError> {
-        let lead = self.lead(store).await?;
-        let window = if self.filters_rows(lead) { SCAN_ROWS } else { SCAN_ROWS.min(limit as u32) };
+        let source = self.row_source(store).await?;
+        let window = match (self.filters_rows(source), source) {
+            (false, _) => READ_ROWS.min(limit as u32),
+            // Each reading goes through all jobs of the state.
+            (true, RowSource::State(_)) => MAX_READ as u32,
+            (true, _) => READ_ROWS,
+        };
         let (mut page, mut place, mut elements) = (CandidatePage::default(), after, HashMap::new());
         let conditions = match self.filter {
             Some(_) => store.walk_conditions().await?,
@@ -96,8 +102,8 @@ impl CandidateQuery {
         };
         let mut read = 0;
         loop {
-            let found = self.read(store, lead, place, window).await?;
-            for (row, searched) in found.rows.into_iter().zip(1..) {
+            let found = self.read(store, source, place, window).await?;
+            for (index, row) in found.rows.into_iter().enumerate() {
                 read += 1;
                 if !self.matches(&row, &mut elements, &conditions) {
                     continue;
@@ -105,7 +111,9 @@ impl CandidateQuery {
                 place = Some(self.cursor_of(&row));
                 page.rows.push(row);
                 if page.rows.len() == limit {
-                    page.scanned += searched;
+                    page.scanned += found.first.map_or(index + 1, |first| {
+                        first.abs_diff(page.rows[limit - 1].decision) as usize + 1
+                    });
                     page.next = place;
                     return Ok(page);
                 }

@@ -1,5 +1,7 @@
 //! Rows of the table as the store has them: which index leads to those of a query.
 
+use std::ops::Range;
+
 use store::{
     JobState, ListCursor, ListLimits, ListOrder, ListedCandidate, NO_LABEL_VALUE, Store, StoreError,
 };
@@ -7,14 +9,14 @@ use store::{
 use super::query::{CandidateQuery, TableOrder};
 use crate::filter::{NumberField, StructureFilter};
 
-/// Up to this number of jobs, those of a state lead to its candidates. With more, they are found among all candidates.
+/// Up to this number of label jobs of a state, its candidates are found by them. With more, they are found among all candidates.
 const MAX_JOBS_OF_STATE: u32 = 100_000;
 /// Decisions that are searched at a time for candidates within limits.
 const SEARCHED_DECISIONS: i64 = 100_000;
 
-/// What leads to rows.
+/// How rows are found.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum RowLead {
+pub(super) enum RowSource {
     /// The index of an order.
     Order,
     /// The label jobs of a state.
@@ -27,6 +29,8 @@ pub(super) enum RowLead {
 #[derive(Debug)]
 pub(super) struct FoundRows {
     pub rows: Vec<ListedCandidate>,
+    /// The decision at which the search for those within limits began.
+    pub first: Option<i64>,
     /// Number of candidates that were searched for them.
     pub searched: usize,
     /// Where to continue; `None` at the end.
@@ -34,15 +38,15 @@ pub(super) struct FoundRows {
 }
 
 impl CandidateQuery {
-    /// What leads to the rows.
-    pub async fn lead(&self, store: &Store) -> Result<RowLead, StoreError> {
+    /// How the rows are found.
+    pub async fn row_source(&self, store: &Store) -> Result<RowSource, StoreError> {
         if self.order == TableOrder::Queue || (self.is_by_decision() && self.only_walk().is_some()) {
-            return Ok(RowLead::Order);
+            return Ok(RowSource::Order);
         }
         if let Some(state) = self.state
             && !store.has_more_jobs(state, MAX_JOBS_OF_STATE).await?
         {
-            return Ok(RowLead::State(state));
+            return Ok(RowSource::State(state));
         }
         let limits = |of| self.filter.as_ref().map_or([None; 2], |filter| filter.limits(of));
         let limits = ListLimits {
@@ -50,14 +54,14 @@ impl CandidateQuery {
             relative_volume: limits(NumberField::RelativeVolume),
         };
         match self.is_by_decision() && limits != ListLimits::default() {
-            true => Ok(RowLead::Limits(limits, store.newest_candidate().await?)),
-            false => Ok(RowLead::Order),
+            true => Ok(RowSource::Limits(limits, store.newest_candidate().await?)),
+            false => Ok(RowSource::Order),
         }
     }
 
     /// Whether rows that are read may be filtered out.
-    pub fn filters_rows(&self, lead: RowLead) -> bool {
-        let is_order = matches!(lead, RowLead::Order);
+    pub fn filters_rows(&self, source: RowSource) -> bool {
+        let is_order = matches!(source, RowSource::Order);
         let by_fate = self.fate.is_some() && is_order && !self.is_by_decision();
         let by_state = self.state.is_some() && is_order && self.order != TableOrder::Queue;
         by_fate || by_state || self.filter.is_some()
@@ -67,27 +71,27 @@ impl CandidateQuery {
     pub async fn read(
         &self,
         store: &Store,
-        lead: RowLead,
+        source: RowSource,
         after: Option<ListCursor>,
         limit: u32,
     ) -> Result<FoundRows, StoreError> {
         // What was declined has no label job.
         if self.state.is_some() && self.origin_and_reason().1.is_some() {
-            return Ok(FoundRows { rows: Vec::new(), searched: 0, next: None });
+            return Ok(FoundRows { rows: Vec::new(), first: None, searched: 0, next: None });
         }
-        if let RowLead::Limits(limits, newest) = lead {
+        if let RowSource::Limits(limits, newest) = source {
             return self.read_within(store, limits, newest, after, limit).await;
         }
-        let rows = self.read_in_order(store, lead, after, limit).await?;
+        let rows = self.read_in_order(store, source, after, limit).await?;
         let is_full = rows.len() == limit as usize;
         let next = rows.last().filter(|_| is_full).map(|last| self.cursor_of(last));
-        Ok(FoundRows { searched: rows.len(), rows, next })
+        Ok(FoundRows { first: None, searched: rows.len(), rows, next })
     }
 
     async fn read_in_order(
         &self,
         store: &Store,
-        lead: RowLead,
+        source: RowSource,
         after: Option<ListCursor>,
         limit: u32,
     ) -> Result<Vec<ListedCandidate>, StoreError> {
@@ -98,8 +102,8 @@ impl CandidateQuery {
             TableOrder::Decision | TableOrder::Queue | TableOrder::Column(_) => ListOrder::Decision,
         };
         let (origin, reason) = self.origin_and_reason();
-        match (lead, self.state, self.only_walk(), origin) {
-            (RowLead::State(state), ..) => {
+        match (source, self.state, self.only_walk(), origin) {
+            (RowSource::State(state), ..) => {
                 store.list_state(state, origin, (order, descending), after, limit).await
             }
             (_, Some(state), ..) if self.order == TableOrder::Queue => {
@@ -125,16 +129,7 @@ impl CandidateQuery {
         limit: u32,
     ) -> Result<FoundRows, StoreError> {
         let (descending, after) = (self.is_descending(), after.map(|place| place.decision));
-        let decisions = match descending {
-            true => {
-                let end = after.unwrap_or(newest + 1).min(newest + 1);
-                (end - SEARCHED_DECISIONS).max(1)..end
-            }
-            false => {
-                let begin = after.map_or(1, |after| after + 1);
-                begin..(begin + SEARCHED_DECISIONS).min(newest + 1)
-            }
-        };
+        let decisions = next_decisions(descending, after, newest, SEARCHED_DECISIONS);
         let (origin, reason) = self.origin_and_reason();
         let fate = origin.map(|origin| (origin, reason));
         let rows = store.list_within(decisions.clone(), limits, fate, descending, limit).await?;
@@ -144,9 +139,10 @@ impl CandidateQuery {
             None if descending => (first, first <= 1),
             None => (last, last >= newest),
         };
-        let searched = if descending { decisions.end - reached } else { reached + 1 - first };
+        let begin = if descending { last } else { first };
+        let searched = if decisions.is_empty() { 0 } else { begin.abs_diff(reached) as usize + 1 };
         let next = (!is_end).then_some(ListCursor { priority: 0, value: 0.0, decision: reached });
-        Ok(FoundRows { rows, searched: searched.max(0) as usize, next })
+        Ok(FoundRows { rows, first: Some(begin), searched, next })
     }
 
     /// Where the rows behind a row begin.
@@ -184,5 +180,60 @@ impl CandidateQuery {
     /// The only walk whose candidates can match.
     fn only_walk(&self) -> Option<u32> {
         self.filter.as_ref().and_then(StructureFilter::only_walk)
+    }
+}
+
+/// At most `number` decisions up to the newest, behind one of them or from the first in this order on.
+fn next_decisions(descending: bool, after: Option<i64>, newest: i64, number: i64) -> Range<i64> {
+    match (descending, after) {
+        (true, after) => {
+            let end = after.unwrap_or(newest + 1).clamp(1, newest + 1);
+            (end - number).max(1)..end
+        }
+        (false, after) => {
+            let begin = after.unwrap_or(0).clamp(0, newest) + 1;
+            begin..(begin + number).min(newest + 1)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_decision_is_searched_once_in_order() {
+        for (descending, newest, number) in [
+            (true, 7, 1),
+            (false, 7, 1),
+            (true, 7, 2),
+            (false, 7, 2),
+            (true, 14, 7),
+            (false, 14, 7),
+            (false, 0, 2),
+        ] {
+            let (mut found, mut after) = (Vec::new(), None);
+            loop {
+                let mut range: Vec<_> = next_decisions(descending, after, newest, number).collect();
+                if descending {
+                    range.reverse();
+                }
+                assert!(range.len() <= number as usize);
+                let Some(last) = range.last() else { break };
+                after = Some(*last);
+                found.extend(range);
+            }
+            let mut expected: Vec<_> = (1..=newest).collect();
+            if descending {
+                expected.reverse();
+            }
+            assert_eq!(found, expected, "{descending} {newest} {number}");
+        }
+        for after in [i64::MIN, -1, 8, i64::MAX] {
+            for descending in [false, true] {
+                let range = next_decisions(descending, Some(after), 7, 2);
+                assert!(range.start >= 1 && range.end <= 8, "{range:?}");
+            }
+        }
     }
 }

@@ -6,7 +6,7 @@ use store::{Store, StoreError, WalkVersions};
 
 use super::columns::{SortColumn, TableRow, read_errors};
 use super::query::{CandidateQuery, PagePlace};
-use super::{DEFAULT_ROWS, MAX_SCANNED};
+use super::{DEFAULT_ROWS, MAX_READ};
 
 /// Largest number of candidates whose errors are read to sort them.
 const MAX_WITH_ERRORS: usize = 1000;
@@ -36,7 +36,7 @@ pub(super) async fn page(
     versions: &WalkVersions,
     reader: &mut ErrorReader,
 ) -> Result<SortedPage, StoreError> {
-    let found = query.collect(store, None, MAX_SCANNED, (MAX_SCANNED, usize::MAX)).await?;
+    let found = query.collect(store, None, MAX_READ, (MAX_READ, usize::MAX)).await?;
     let mut is_all = found.next.is_none();
     let mut rows: Vec<_> = found.rows.into_iter().map(|one| TableRow::new(one, versions)).collect();
     if column.is_error() {
