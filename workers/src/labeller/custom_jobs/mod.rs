@@ -238,3 +238,50 @@ fn no_submission_left(job: &CustomJob) -> StoreError {
 fn job_error(job: &CustomJob, why: impl ToString) -> StoreError {
     file_error(&job.directory, io::Error::other(why.to_string()))
 }
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::process::Command;
+
+    use super::super::calculation_runner::RunnerCommand;
+    use super::*;
+
+    /// The jobs of lost ids may still wait: they do nothing when they start.
+    #[tokio::test]
+    async fn a_calculation_without_a_submission_left_is_closed_before_it_is_given_up() {
+        let home = tempfile::tempdir().unwrap();
+        let scheduler: CustomScheduler = toml::from_str(
+            "name = \"files\"\nsubmit = \"false\"\npoll = \"false\"\ncancel = \"false\"\nvanished = [\"unknown\"]\n\
+             states = { pending = [], running = [\"R\"], completed = [\"F\"] }\nscript = \"{command}\"\n",
+        )
+        .unwrap();
+        let jobs = CustomJobs::new(scheduler, &PassedEnvironment::default());
+        let calculation = Calculation {
+            directory: home.path().to_owned(),
+            command: vec!["abinit".to_owned()],
+            environment: Vec::new(),
+            pass_environment: Default::default(),
+            time_limit: 3600.0,
+            memory_limit: None,
+            runner: RunnerCommand { program: "/bin/touch".into(), arguments: vec!["ran".to_owned()] },
+        };
+        let job = jobs.prepare(calculation, 1, 0).unwrap();
+        assert_eq!(jobs.inspect(&job).await.unwrap(), CalculationState::Ready);
+        while job.begin_submission().unwrap().is_some() {}
+        assert_eq!(jobs.inspect(&job).await.unwrap(), CalculationState::Gone);
+        assert!(job.is_closed());
+        let script = fs::read_to_string(job.script(1)).unwrap();
+        assert!(Command::new("sh").args(["-c", &script]).status().unwrap().success());
+        assert!(!home.path().join("ran").exists());
+        // The next labeller comes to the same conclusion, and one that submits it says why it cannot.
+        assert_eq!(jobs.inspect(&job).await.unwrap(), CalculationState::Gone);
+        let error = jobs.submit(&job).await.unwrap_err().to_string();
+        assert!(error.contains("none of its 4 submissions has begun"), "{error}");
+        // One that has begun cannot be closed.
+        fs::remove_file(home.path().join(job::BEGUN)).unwrap();
+        assert!(Command::new("sh").args(["-c", &script]).status().unwrap().success());
+        assert!(home.path().join("ran").exists() && !job.close().unwrap());
+        assert_eq!(jobs.inspect(&job).await.unwrap(), CalculationState::Running);
+    }
+}
