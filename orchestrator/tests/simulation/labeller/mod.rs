@@ -25,7 +25,7 @@ const HEARTBEAT_INTERVAL: Time = 15_000;
 const POLL_INTERVAL: Time = 6_000;
 /// Time between two tries of a write while the database is busy or the disk full.
 const RETRY_INTERVAL: Time = 1_000;
-/// A replaced labeller may begin no label so long after its successor started.
+/// A replaced labeller may begin no label so long after its successor registered.
 const REPLACED_AFTER: Time = 3 * HEARTBEAT_INTERVAL;
 
 /// A process of a labeller.
@@ -33,14 +33,14 @@ pub struct Labeller {
     pub number: u32,
     pub record: ProcessRecord,
     pub stopped_until: Time,
-    started: Time,
     phase: Phase,
     /// What it was told to do last; earlier events mean nothing.
     token: u64,
     /// Asked to stop.
     stop: bool,
     no_more_jobs: bool,
-    is_registered: bool,
+    /// When the store learned of it.
+    registered: Option<Time>,
     /// It has removed what killed labellers left.
     has_cleaned: bool,
 }
@@ -87,12 +87,11 @@ impl World {
                 number,
                 record,
                 stopped_until: 0,
-                started: self.now,
                 phase: Phase::Begins,
                 token: 0,
                 stop: false,
                 no_more_jobs: false,
-                is_registered: false,
+                registered: None,
                 has_cleaned: false,
             },
         );
@@ -170,7 +169,7 @@ impl World {
             });
         match written {
             Ok(()) => {
-                self.labellers.get_mut(&id).unwrap().is_registered = true;
+                self.labellers.get_mut(&id).unwrap().registered = Some(self.now);
                 self.labeller_continues(id, Phase::Idle, 0);
                 self.after(0, Event::LabellerHeartbeat(id));
             }

@@ -56,9 +56,8 @@ impl World {
     /// A labeller that was replaced, and could know it, leases nothing.
     fn check_not_replaced(&mut self, id: u32) {
         let Labeller { number, stopped_until, .. } = self.labellers[&id];
-        let newer =
-            self.labellers.range(id + 1..).filter(|(_, other)| other.number == number && other.is_registered);
-        let since = newer.map(|(_, other)| other.started.max(stopped_until)).min();
+        let newer = self.labellers.range(id + 1..).filter(|(_, other)| other.number == number);
+        let since = newer.filter_map(|(_, other)| Some(other.registered?.max(stopped_until))).min();
         let reachable = self.store.away_until.max(self.store.full_until);
         if since.is_some_and(|since| self.now > since.max(reachable) + REPLACED_AFTER) {
             self.fail(format!("labeller process {id} leases a job although it was replaced"));
