@@ -293,7 +293,7 @@ impl Calculation {
                 return Ok((None, most));
             }
             children.reap()?;
-            // Nobody can read its results any more.
+            // No labeller can read its results any more.
             let found = self.directory.symlink_metadata();
             if found.is_err_and(|error| error.kind() == ErrorKind::NotFound) {
                 return Ok((Some(Exit::LostNode), most));

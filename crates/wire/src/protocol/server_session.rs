@@ -307,7 +307,7 @@ mod tests {
         assert!(server.take_incoming().is_empty());
         server.process_ended(SENDER.walker, SENDER.incarnation, true);
         assert!(matches!(server.take_incoming()[..], [Incoming::Lost { walker: 3, crashed: true }]));
-        // The reactor learns that its decision reaches nobody.
+        // The reactor learns that its decision reaches no walker.
         assert!(reply.send(None).is_err());
         assert!(server.receive(&walker.poll()).is_err());
         server.expect(SENDER.walker, SENDER.incarnation + 1);

@@ -68,7 +68,7 @@ impl CalculationFiles {
 pub enum DirectoryRemoval {
     /// The store has the result.
     Delivered,
-    /// Nobody needs the result.
+    /// The result is not needed.
     NotNeeded,
     /// Nothing can be waited for there, or a newer calculation is.
     Lost { has_newer: bool },

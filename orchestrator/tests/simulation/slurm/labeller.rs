@@ -251,7 +251,7 @@ impl LabellerIo {
         }
     }
 
-    /// Removes directories that killed labellers left and that nobody needs.
+    /// Removes directories that killed labellers left and whose results are not needed.
     async fn clean_up(&self) -> Failing<()> {
         let old = self.files.borrow().older_than(MIN_AGE);
         for name in old {
