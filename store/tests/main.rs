@@ -3,6 +3,7 @@
 mod common;
 
 mod assignments;
+mod attempts;
 mod backup;
 mod budget;
 mod campaign;
