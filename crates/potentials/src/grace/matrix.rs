@@ -211,14 +211,16 @@ impl StridedRows<'_> {
     #[inline(always)]
     fn block<const N: usize>(&self, first: usize) -> [usize; N] {
         let (mut r, mut s) = (first / self.slots, first % self.slots);
-        std::array::from_fn(|_| {
-            let lane = self.starts[r] as usize * self.slots + s * self.stride + self.shift;
+        let mut lanes = [0; N];
+        // A closure for `array::from_fn` is not always inlined.
+        for lane in &mut lanes {
+            *lane = self.starts[r] as usize * self.slots + s * self.stride + self.shift;
             s += 1;
             if s == self.slots {
                 (r, s) = (r + 1, 0);
             }
-            lane
-        })
+        }
+        lanes
     }
 }
 
