@@ -28,7 +28,7 @@ fn export(directory: &Path) -> Vec<Frame> {
     read_extxyz(&directory.join("dataset.extxyz")).unwrap()
 }
 
-/// The text of the demo with one k-point instead of 2 × 2 × 2: for tests in which the numbers of the labels do not matter.
+/// The text of the demo with one k-point instead of 2 × 2 × 2: for tests that need no accurate labels.
 fn quick_demo() -> String {
     let text = demo("silicon-dft.toml");
     let quick = text.replace("k_spacing = 0.6 ", "k_spacing = 4.0 ");
@@ -46,9 +46,9 @@ fn quick_espresso_demo() -> String {
     text
 }
 
-/// The demo with one structure of each walk.
+/// The demo with one k-point and one structure of each walk.
 fn shorter_demo(here: &Path) -> PathBuf {
-    let text = demo("silicon-dft.toml");
+    let text = quick_demo();
     let shorter = text.replace("# max_per_walk = 3 ", "max_per_walk = 1 ");
     assert_ne!(shorter, text);
     let path = here.join("silicon-dft.toml");
@@ -56,8 +56,8 @@ fn shorter_demo(here: &Path) -> PathBuf {
     path
 }
 
-/// `label-file` makes the same label as the campaign. The demo collects one structure of each walk in place of three, unless
-/// `CALMWALK_WHOLE_DEMOS` is set: each label takes twenty seconds of a processor.
+/// `label-file` makes the same label as the campaign. Each label of the demo takes twenty seconds of a processor, so it stands as it is only
+/// if `CALMWALK_WHOLE_DEMOS` is set. Otherwise it has one k-point, and collects one structure of each walk in place of three.
 #[test]
 fn the_demo_makes_labels_of_all_its_structures() {
     let directory = tempfile::tempdir().unwrap();
