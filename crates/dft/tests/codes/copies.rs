@@ -35,8 +35,13 @@ fn abinit_reads_copies() {
     let xml = copies("/usr/share/abinit/psp/Pseudodojo_paw_pbe_standard", &["Si.xml"]);
     for data in [psp8, xml] {
         let pseudopotentials = data.path().to_owned();
-        let settings =
-            abinit::AbinitSettings { pseudopotentials, cutoff: 200.0, k_spacing: 1.2, ..Default::default() };
+        let settings = abinit::AbinitSettings {
+            pseudopotentials,
+            cutoff: 200.0,
+            k_spacing: 1.2,
+            spin_polarized: false,
+            ..Default::default()
+        };
         needs_no_files(&settings.prepare(&PassedEnvironment::default()).unwrap(), data);
     }
 }
@@ -50,6 +55,7 @@ fn espresso_reads_copies() {
             pseudopotentials: data.path().to_owned(),
             cutoff: 200.0,
             k_spacing: 1.2,
+            spin_polarized: false,
             ..Default::default()
         };
         needs_no_files(&settings.prepare(&PassedEnvironment::default()).unwrap(), data);
@@ -60,8 +66,13 @@ fn espresso_reads_copies() {
 fn gpaw_reads_copies() {
     let data = copies("/usr/share/gpaw-setups", &["Si.PBE.gz"]);
     let pseudopotentials = Some(data.path().to_owned());
-    let settings =
-        gpaw::GpawSettings { pseudopotentials, cutoff: 200.0, k_spacing: 1.2, ..Default::default() };
+    let settings = gpaw::GpawSettings {
+        pseudopotentials,
+        cutoff: 200.0,
+        k_spacing: 1.2,
+        spin_polarized: false,
+        ..Default::default()
+    };
     needs_no_files(&settings.prepare(&PassedEnvironment::default()).unwrap(), data);
 }
 
@@ -75,6 +86,7 @@ fn cp2k_reads_copies() {
         relative_cutoff: 400.0,
         density_tolerance: 1e-6,
         k_spacing: 10.0,
+        spin_polarized: false,
         ..Default::default()
     };
     needs_no_files(&settings.prepare(&PassedEnvironment::default()).unwrap(), data);

@@ -34,7 +34,7 @@ fn the_forces_of_aluminium_are_derivatives_of_the_free_energy() {
 
 #[test]
 fn the_oxygen_molecule_is_a_magnet_in_its_own_vacuum() {
-    let code = GpawSettings { spin_polarized: true, cutoff: 400.0, vacuum: 5.0, ..settings() }
+    let code = GpawSettings { spin_polarized: true, cutoff: 300.0, vacuum: 4.0, ..settings() }
         .prepare(&PassedEnvironment::default())
         .unwrap();
     let structure = structures::oxygen();
