@@ -45,7 +45,7 @@ fn gracemaker_grades_by_an_artifact_that_was_built() {
     let path = |file: &str| config(&format!("data/al_eam_1l/{file}")).display().to_string();
     let (model, data) = (path("kokkos.npz"), path("seed_frames.extxyz"));
     succeed(here, ["calm", "build", "--model", &model, &data, "--output", "calm.npz", "--shard-size", "9"]);
-    let grades = both_grades(here, &model, "calm.npz", &data);
+    let grades = &both_grades(here, &[(&model, "calm.npz", &data)])[0];
     assert!(grades.len() == 5400 && grades.iter().any(|[gamma, _]| *gamma > 1.0));
 }
 
@@ -71,10 +71,9 @@ fn gracemaker_grades_by_an_artifact_of_several_elements() {
     );
     let artifact = Artifact::load(here.join("calm.npz")).unwrap();
     assert!(artifact.mixture.iter().any(|(_, slot, _)| slot > 0));
-    for (model, artifact) in
-        [(model.as_str(), "calm.npz"), ("plain.npz", "own.npz"), ("own_model.npz", "own.npz")]
-    {
-        let grades = both_grades(here, model, artifact, "all.extxyz");
+    let cases = [(model.as_str(), "calm.npz"), ("plain.npz", "own.npz"), ("own_model.npz", "own.npz")]
+        .map(|(model, artifact)| (model, artifact, "all.extxyz"));
+    for ((model, ..), grades) in cases.iter().zip(both_grades(here, &cases)) {
         assert!(grades.iter().any(|[gamma, _]| *gamma > 1.0), "{model}");
     }
 }
@@ -87,11 +86,15 @@ fn gracemaker_grades_by_the_mixture_of_a_campaign() {
     succeed(here, ["run", "campaign.toml"]);
     let path = |file: &str| config(&format!("data/al_eam_1l/{file}")).display().to_string();
     let (model, data) = (path("kokkos.npz"), path("seed_frames.extxyz"));
-    let original = both_grades(here, &model, &path("gmm_artifacts.npz"), &data);
-    for version in [["--version", "1"].as_slice(), &[]] {
-        succeed(here, ["calm", "export", "campaign", "--output", "calm.npz"].iter().chain(version));
-        let grades = both_grades(here, &model, "calm.npz", &data);
-        let moved = grades.iter().zip(&original).any(|([new, _], [old, _])| (new / old - 1.0).abs() > 1e-2);
+    for (output, version) in [("first.npz", ["--version", "1"].as_slice()), ("newest.npz", &[])] {
+        succeed(here, ["calm", "export", "campaign", "--output", output].iter().chain(version));
+    }
+    let original = path("gmm_artifacts.npz");
+    let cases =
+        [&original, "first.npz", "newest.npz"].map(|artifact| (model.as_str(), artifact, data.as_str()));
+    let [original, versions @ ..] = &both_grades(here, &cases)[..] else { unreachable!() };
+    for grades in versions {
+        let moved = grades.iter().zip(original).any(|([new, _], [old, _])| (new / old - 1.0).abs() > 1e-2);
         assert!(moved);
     }
 }
@@ -100,43 +103,59 @@ fn gracemaker_grades_by_the_mixture_of_a_campaign() {
 fn artifacts_of_gracemaker_give_its_grades() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    for name in ["al_eam_1l", "ni_al_h_eam_1l", "si_sw_1l"] {
+    let cases = ["al_eam_1l", "ni_al_h_eam_1l", "si_sw_1l"].map(|name| {
         let path = |file: &str| config(&format!("data/{name}/{file}")).display().to_string();
         let frames = read_extxyz(Path::new(&path("seed_frames.extxyz"))).unwrap();
-        write_frames(&here.join("some.extxyz"), &frames[..frames.len().min(40)]);
-        both_grades(here, &path("kokkos.npz"), &path("gmm_artifacts.npz"), "some.extxyz");
-    }
+        let some = format!("{name}.extxyz");
+        write_frames(&here.join(&some), &frames[..frames.len().min(40)]);
+        [path("kokkos.npz"), path("gmm_artifacts.npz"), some]
+    });
+    both_grades(here, &cases.each_ref().map(|[model, artifact, data]| (&**model, &**artifact, &**data)));
 }
 
-/// γ of all atoms of `data` from this program and from gracemaker, which must agree to 10⁻⁶.
-fn both_grades(here: &Path, model: &str, artifact: &str, data: &str) -> Vec<[f64; 2]> {
+/// γ of all atoms of the structures of each case (model, artifact, structures) from this program and from gracemaker, which must agree to
+/// 10⁻⁶. gracemaker starts once for all cases: its import takes longer than the grades.
+fn both_grades(here: &Path, cases: &[(&str, &str, &str)]) -> Vec<Vec<[f64; 2]>> {
     let variable = "CALMWALK_GRACEMAKER_PYTHON";
     let python = std::env::var_os(variable).unwrap_or_else(|| panic!("{variable} names no Python"));
+    let own: Vec<Vec<f64>> = cases.iter().enumerate().map(|(k, case)| own_grades(here, k, *case)).collect();
+    let artifacts: Vec<&str> = cases.iter().map(|(_, artifact, _)| *artifact).collect();
+    let script = format!(
+        "import json, numpy as np, tensorflow as tf\n\
+         from tensorpotential.uq.gmmuq import GMMUQModel\n\
+         grades = []\n\
+         for k, artifact in enumerate({artifacts:?}):\n    \
+             model = GMMUQModel(artifact, param_dtype=tf.float64)\n    \
+             elements = tf.constant(json.load(open(f'{{k}}.json')), tf.int32)\n    \
+             gamma, _ = model.gamma_from_features(tf.constant(np.load(f'{{k}}.npy')), elements)\n    \
+             grades.append(gamma.numpy().tolist())\n\
+         print(json.dumps(grades))"
+    );
+    let found: Vec<Vec<f64>> = last_line(here, Path::new(&python), &script);
+    assert_eq!(found.len(), own.len());
+    let both = |(own, found): (Vec<f64>, Vec<f64>)| {
+        assert_eq!(found.len(), own.len());
+        for (found, own) in found.iter().zip(&own) {
+            assert!((found / own - 1.0).abs() < 1e-6, "{found} {own}");
+        }
+        own.into_iter().zip(found).map(|(own, found)| [own, found]).collect()
+    };
+    own.into_iter().zip(found).map(both).collect()
+}
+
+/// γ of all atoms from this program, which writes their features to `K.npy` and their elements, as numbers of the artifact, to `K.json`.
+fn own_grades(here: &Path, k: usize, (model, artifact, data): (&str, &str, &str)) -> Vec<f64> {
+    let features = format!("{k}.npy");
     let score = ["calm", "score", "--model", model, "--artifact", artifact, data, "--output", "out.extxyz"];
-    succeed(here, score.into_iter().chain(["--features", "z.npy"]));
+    succeed(here, score.into_iter().chain(["--features", &features]));
     let frames = read_extxyz(&here.join("out.extxyz")).unwrap();
-    let own: Vec<f64> = frames.iter().flat_map(|frame| frame.arrays["gamma"].reals().unwrap()).collect();
     let symbols = Artifact::load(here.join(artifact)).unwrap().symbols;
     let species = frames.iter().flat_map(|frame| &frame.structure.species);
     let elements: Vec<usize> = species
         .map(|element| symbols.iter().position(|symbol| symbol == element.symbol()).unwrap())
         .collect();
-    std::fs::write(here.join("elements.json"), serde_json::to_vec(&elements).unwrap()).unwrap();
-    let script = format!(
-        "import json, numpy as np, tensorflow as tf\n\
-         from tensorpotential.uq.gmmuq import GMMUQModel\n\
-         z = np.load('z.npy')\n\
-         model = GMMUQModel({artifact:?}, param_dtype=tf.float64)\n\
-         elements = tf.constant(json.load(open('elements.json')), tf.int32)\n\
-         gamma, _ = model.gamma_from_features(tf.constant(z), elements)\n\
-         print(json.dumps(gamma.tolist()))"
-    );
-    let found: Vec<f64> = last_line(here, Path::new(&python), &script);
-    assert_eq!(found.len(), own.len());
-    for (found, own) in found.iter().zip(&own) {
-        assert!((found / own - 1.0).abs() < 1e-6, "{found} {own}");
-    }
-    own.into_iter().zip(found).map(|(own, found)| [own, found]).collect()
+    std::fs::write(here.join(format!("{k}.json")), serde_json::to_vec(&elements).unwrap()).unwrap();
+    frames.iter().flat_map(|frame| frame.arrays["gamma"].reals().unwrap()).collect()
 }
 
 /// A model's export without the arrays of features and mixture.
