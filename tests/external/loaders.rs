@@ -128,7 +128,7 @@ fn both_grades(here: &Path, cases: &[(&str, &str, &str)]) -> Vec<Vec<[f64; 2]>> 
              model = GMMUQModel(artifact, param_dtype=tf.float64)\n    \
              elements = tf.constant(json.load(open(f'{{k}}.json')), tf.int32)\n    \
              gamma, _ = model.gamma_from_features(tf.constant(np.load(f'{{k}}.npy')), elements)\n    \
-             grades.append(gamma.numpy().tolist())\n\
+             grades.append(gamma.tolist())\n\
          print(json.dumps(grades))"
     );
     let found: Vec<Vec<f64>> = last_line(here, Path::new(&python), &script);
