@@ -81,7 +81,7 @@ async fn before_label(
     version: u32,
     content: &str,
 ) -> Result<(CalibrationState, Option<ArrivedLabel>), StoreError> {
-    let mut labelled = ArrivedLabels::new(store, protocol, version).await?;
+    let mut labelled = ArrivedLabels::new(store, protocol, version);
     let mut state = CalibrationState::new(version);
     while let Some(structure) = labelled.next().await? {
         if structure.content.to_string() == content {

@@ -41,7 +41,7 @@ pub async fn read(
     protocol: ContentHash,
     version: u32,
 ) -> Result<CalibrationState, StoreError> {
-    let mut labelled = ArrivedLabels::new(store, protocol, version).await?;
+    let mut labelled = ArrivedLabels::new(store, protocol, version);
     let mut state = CalibrationState::new(version);
     while let Some(structure) = labelled.next().await? {
         state.learn(&structure);

@@ -5,10 +5,10 @@ mod tests;
 
 use std::collections::BTreeMap;
 
-use store::{ArrivalSum, LabelArrival, Store, StoreError, WalkVersions};
+use store::{ArrivalSum, LabelArrival, Store, StoreError};
 use wire::ContentHash;
 
-use super::learning::{PAGE_ROWS, labelled_structure, version_of};
+use super::learning::{ArrivalPages, labelled_structure};
 use super::{CalibrationState, CalibrationSummary};
 
 /// Keeps the calibrations of all versions of the potential, so that each reading costs what is new.
@@ -39,16 +39,14 @@ impl CalibrationReader {
         if self.protocol != Some(protocol) || self.sum != known {
             *self = Self { protocol: Some(protocol), ..Self::default() };
         }
-        // The walks of these labels are in the store. Later ones are read the next time.
-        let newest = store.newest_label().await?;
-        let versions = store.walk_versions().await?;
-        let mut read = 0;
+        let (mut pages, mut read) = (ArrivalPages::new(store, protocol, self.after), 0);
         loop {
-            let mut page = store.label_arrivals(protocol, self.after, PAGE_ROWS).await?;
-            page.retain(|arrival| arrival.number <= newest);
-            let Some(last) = page.last() else { return Ok(read) };
-            page.iter().for_each(|arrival| self.learn(arrival, &versions));
-            self.after = Some((last.number, last.candidate.decision));
+            let page = pages.next().await?;
+            if page.is_empty() {
+                return Ok(read);
+            }
+            page.iter().for_each(|(version, arrival)| self.learn(*version, arrival));
+            self.after = pages.after();
             read += page.len() as u64;
         }
     }
@@ -65,9 +63,8 @@ impl CalibrationReader {
     }
 
     /// Learns from a structure, once for each version whose walks found it.
-    fn learn(&mut self, arrival: &LabelArrival, versions: &WalkVersions) {
+    fn learn(&mut self, version: u32, arrival: &LabelArrival) {
         self.sum.add(arrival);
-        let version = version_of(arrival, versions);
         let empty = || LearnedVersion { state: CalibrationState::new(version), last: 0 };
         let learned = self.versions.entry(version).or_insert_with(empty);
         if learned.last != arrival.number {

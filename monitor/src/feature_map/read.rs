@@ -40,6 +40,8 @@ struct MapElement {
 
 /// Reads structures that walks with the newest version of the potential found.
 pub async fn read(store: &Store) -> Result<MapSample, StoreError> {
+    // Walks are in the store before their candidates: none up to this one is of a version that is not known yet.
+    let newest = store.newest_candidate().await?;
     let versions = store.walk_versions().await?;
     let version = versions.newest();
     let protocol = store.protocol_in_force().await?.map(|protocol| protocol.hash);
@@ -49,7 +51,8 @@ pub async fn read(store: &Store) -> Result<MapSample, StoreError> {
     for ((origin, room), part) in
         [(Origin::Biased, ACCEPTED_SAMPLE), (Origin::Control, CONTROL_SAMPLE)].into_iter().zip(&mut parts)
     {
-        let chosen = store.sampled_decisions(origin, versions.walks_of(version), room).await?;
+        let mut chosen = store.sampled_decisions(origin, versions.walks_of(version), room).await?;
+        chosen.decisions.retain(|decision| *decision <= newest);
         let before = sample.structures.len();
         for page in chosen.decisions.chunks(PAGE) {
             store.collected_features(protocol, page).await?.iter().for_each(|found| sample.add(found));

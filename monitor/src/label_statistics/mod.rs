@@ -81,6 +81,8 @@ pub async fn read(
     protocol: ContentHash,
     version: Option<u32>,
 ) -> Result<LabelStatistics, StoreError> {
+    // Walks are in the store before their candidates: the versions of all up to this one are known.
+    let newest = store.newest_candidate().await?;
     let versions = store.walk_versions().await?;
     let version = match version {
         Some(version) => version,
@@ -106,14 +108,17 @@ pub async fn read(
         let page = store.labelled_after(protocol, after, PAGE_ROWS).await?;
         let Some(last) = page.last() else { break };
         after = last.decision;
-        page.iter().for_each(|row| statistics.labelled(row, (&versions, version), &shared));
+        let known = page.iter().filter(|row| row.decision <= newest);
+        known.for_each(|row| statistics.labelled(row, (&versions, version), &shared));
     }
     let mut after = 0;
     loop {
         let page = store.failed_after(protocol, after, PAGE_ROWS).await?;
         let Some(last) = page.last() else { break };
         after = last.decision;
-        let own = page.iter().filter(|candidate| versions.version_of(candidate.walk) == version);
+        let own = page.iter().filter(|candidate| {
+            candidate.decision <= newest && versions.version_of(candidate.walk) == version
+        });
         own.for_each(|candidate| statistics.failed(candidate, &shared));
     }
     Ok(statistics)

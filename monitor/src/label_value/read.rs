@@ -69,8 +69,9 @@ impl LabelOrderReader {
     pub async fn read(&mut self, store: &Store, protocol: ContentHash) -> Result<OrderInputs, StoreError> {
         self.calibrations.read(store, protocol).await?;
         let structures = &mut self.structures;
-        let versions = store.walk_versions().await?;
         let queued = store.queued_structures(protocol, MAX_QUEUED).await?;
+        // After the structures: versions that were read before may lack walks that have begun meanwhile.
+        let versions = store.walk_versions().await?;
         let costs = CostEstimator::from_store(store, protocol).await?;
         let (mut used, mut covering, mut models) = (HashSet::new(), Vec::new(), HashMap::new());
         let mut of_queue: BTreeSet<u32> =

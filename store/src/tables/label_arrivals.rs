@@ -65,11 +65,6 @@ impl Store {
         Ok(ArrivalSum { rows, sum })
     }
 
-    /// Number of the newest label of any protocol; 0 without one.
-    pub async fn newest_label(&self) -> Result<i64> {
-        query("SELECT coalesce(max(number), 0) FROM label").fetch_one(&self.database).await
-    }
-
     async fn protocol_number(&self, protocol: ContentHash) -> Result<i64> {
         let found = query("SELECT number FROM protocol WHERE hash = $1").bind(protocol.0.to_vec());
         let found = found.fetch_optional(&self.database).await?;

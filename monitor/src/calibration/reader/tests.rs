@@ -11,6 +11,7 @@ use store::{
 use wire::messages::WalkProgress;
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
+use super::super::learning::ArrivedLabels;
 use super::super::{CalibrationReader, CalibrationState, read};
 
 const CAMPAIGN: CampaignId = CampaignId([5; 16]);
@@ -71,7 +72,15 @@ impl RandomCampaign {
         store.add_protocol(&protocol, 0).await.unwrap();
         let rule = LowerStateRule { on_lower_state: OnLowerState::Supersede, ..LowerStateRule::default() };
         store.set_lower_state_rule(&rule).await.unwrap();
-        let walks = (0..).zip(VERSIONS).map(|(number, version)| WalkRecord {
+        let campaign = Self { store, draws: Draws(seed), step: 0, leases: Vec::new() };
+        for (number, version) in (0..).zip(VERSIONS) {
+            campaign.begin_walk(number, version).await;
+        }
+        campaign
+    }
+
+    async fn begin_walk(&self, number: u32, version: u32) {
+        let walk = WalkRecord {
             walk: WalkId(number),
             origin: Origin::Biased,
             partner: None,
@@ -84,9 +93,8 @@ impl RandomCampaign {
             progress: WalkProgress::default(),
             selector_state: "{}".into(),
             checkpoint: None,
-        });
-        store.commit(&Commit { walks: walks.collect(), ..Commit::default() }).await.unwrap();
-        Self { store, draws: Draws(seed), step: 0, leases: Vec::new() }
+        };
+        self.store.commit(&Commit { walks: vec![walk], ..Commit::default() }).await.unwrap();
     }
 
     /// A walk finds any structure.
@@ -136,6 +144,16 @@ impl RandomCampaign {
         };
         let commit = Commit { decisions: vec![decision], candidates: vec![record], ..Commit::default() };
         self.store.commit(&commit).await.unwrap();
+    }
+
+    /// A walk finds a structure, which gets its label. Returns the candidate's name.
+    async fn find_labelled(&mut self, walk: u32, number: u64) -> String {
+        self.find(walk, number).await;
+        let lease = self.store.lease(PROTOCOL, "a", 0, 9).await.unwrap().unwrap();
+        let forces = vec![[0.1, 0.0, 0.0]; 2];
+        let label = Label { energy: -1.0, forces, stress: None, details: Default::default() };
+        self.store.complete(&lease, &label, 1).await.unwrap();
+        lease.candidate
     }
 
     /// Delivers the label of a lease; another labeller may have delivered one before.
@@ -233,12 +251,7 @@ async fn a_reading_costs_what_is_new() {
     let mut reader = CalibrationReader::default();
     let mut names = Vec::new();
     for number in 0..8 {
-        campaign.find(0, number).await;
-        let lease = campaign.store.lease(PROTOCOL, "a", 0, 9).await.unwrap().unwrap();
-        let forces = vec![[0.1, 0.0, 0.0]; 2];
-        let label = Label { energy: -1.0, forces, stress: None, details: Default::default() };
-        campaign.store.complete(&lease, &label, 1).await.unwrap();
-        names.push(lease.candidate);
+        names.push(campaign.find_labelled(0, number).await);
         assert_eq!(campaign.compare(&mut reader).await, 1);
     }
     campaign.store.exclude(&names[..1], "doubtful", 2).await.unwrap();
@@ -249,4 +262,20 @@ async fn a_reading_costs_what_is_new() {
         8,
         "a walk of another version has found one of the structures"
     );
+}
+
+/// While labels are read, a walk of a new version begins and finds a structure that has its label.
+#[tokio::test]
+async fn a_label_counts_for_walks_that_begin_during_the_reading() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut campaign = RandomCampaign::begin(directory.path(), 8).await;
+    let (store, content) = (campaign.store.clone(), ContentHash::from_structure(&structure(0)));
+    campaign.find_labelled(2, 0).await;
+    let mut readings = [1, 2].map(|version| ArrivedLabels::new(&store, PROTOCOL, version));
+    assert_eq!(readings[0].next().await.unwrap().unwrap().content, content);
+    assert!(readings[1].next().await.unwrap().is_none());
+    campaign.begin_walk(3, 2).await;
+    campaign.find(3, 0).await;
+    assert!(readings[0].next().await.unwrap().is_none(), "the walk has another version");
+    assert_eq!(readings[1].next().await.unwrap().unwrap().content, content);
 }

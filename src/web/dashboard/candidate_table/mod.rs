@@ -47,16 +47,17 @@ struct CandidatePage {
 pub async fn page(State(dashboard): State<Dashboard>, RawQuery(query): RawQuery) -> ApiResult {
     let query = CandidateQuery::parse(query.as_deref().unwrap_or_default())?;
     let store = &dashboard.store;
-    let versions = store.walk_versions().await?;
     let mut reader = ErrorReader::new(store).await?;
-    let (rows, next, scanned, sorted) = if let TableOrder::Column(column) = query.order {
-        let found = sorted::page(&query, column, store, &versions, &mut reader).await?;
-        (found.rows, found.next, found.scanned, Some(found.among))
+    // Versions are read after the rows: before, they may lack walks that have begun meanwhile.
+    let (rows, next, scanned, sorted, versions) = if let TableOrder::Column(column) = query.order {
+        let found = sorted::page(&query, column, store, &mut reader).await?;
+        (found.rows, found.next, found.scanned, Some(found.among), found.versions)
     } else {
         let CandidatePage { rows, next, scanned } = query.page(store).await?;
+        let versions = store.walk_versions().await?;
         let mut rows: Vec<_> = rows.into_iter().map(|one| TableRow::new(one, &versions)).collect();
         columns::read_errors(&mut rows, store, &mut reader).await?;
-        (rows, next.map(PagePlace::Behind), scanned, None)
+        (rows, next.map(PagePlace::Behind), scanned, None, versions)
     };
     let imported = match query.state.filter(|_| query.order == TableOrder::Queue) {
         Some(state) => Some(store.imported_jobs(state).await?),
@@ -166,7 +167,7 @@ fn properties<'a>(
         energy: row.energy,
         max_force: row.max_force,
         retry_adjustments: row.retry_adjustments.as_deref(),
-        // The list has no positions.
+        // The list has no positions, and refuses such a filter.
         fragments: None,
         species,
         origin: &row.origin,

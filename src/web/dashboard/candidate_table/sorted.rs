@@ -17,6 +17,7 @@ pub(super) struct SortedPage {
     pub next: Option<PagePlace>,
     pub scanned: usize,
     pub among: SortedAmong,
+    pub versions: WalkVersions,
 }
 
 /// What was sorted.
@@ -33,12 +34,12 @@ pub(super) async fn page(
     query: &CandidateQuery,
     column: SortColumn,
     store: &Store,
-    versions: &WalkVersions,
     reader: &mut ErrorReader,
 ) -> Result<SortedPage, StoreError> {
     let found = query.collect(store, None, MAX_READ, (MAX_READ, usize::MAX)).await?;
+    let versions = store.walk_versions().await?;
     let mut is_all = found.next.is_none();
-    let mut rows: Vec<_> = found.rows.into_iter().map(|one| TableRow::new(one, versions)).collect();
+    let mut rows: Vec<_> = found.rows.into_iter().map(|one| TableRow::new(one, &versions)).collect();
     if column.is_error() {
         rows.retain(|row| row.candidate.energy.is_some());
         is_all &= rows.len() <= MAX_WITH_ERRORS;
@@ -63,5 +64,5 @@ pub(super) async fn page(
     if !column.is_error() {
         read_errors(&mut rows, store, reader).await?;
     }
-    Ok(SortedPage { rows, next, scanned: found.scanned, among })
+    Ok(SortedPage { rows, next, scanned: found.scanned, among, versions })
 }
