@@ -9,7 +9,7 @@ pub enum ListOrder {
     Decision,
     /// Largest γ under the original mixture. Leaves out candidates without a finite value.
     Gamma,
-    /// V/V₀. Leaves out candidates without it.
+    /// V/V₀. Leaves out candidates without a finite value.
     Volume,
 }
 

@@ -3,7 +3,7 @@
 use serde_json::json;
 use store::{
     CandidateRecord, Fate, JobState, ListCursor, ListLimits, ListOrder, ListedCandidate, NewProtocol,
-    RelabelRequest, Store,
+    RelabelRequest, Store, StoreError,
 };
 use wire::messages::DeclineReason;
 use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
@@ -94,6 +94,25 @@ async fn in_all_states(store: &Store) {
     }
 }
 
+/// Decisions on all candidates of an order, read by `page` from a cursor on.
+async fn in_pages(
+    order: ListOrder,
+    page: impl AsyncFn(Option<ListCursor>) -> Result<Vec<ListedCandidate>, StoreError>,
+) -> Vec<i64> {
+    let (mut found, mut after) = (Vec::new(), None);
+    loop {
+        let page = page(after).await.unwrap();
+        let Some(last) = page.last() else { return found };
+        let value = match order {
+            ListOrder::Decision => None,
+            ListOrder::Gamma => last.gamma,
+            ListOrder::Volume => last.relative_volume,
+        };
+        after = Some(ListCursor { priority: 0, value: value.unwrap_or_default(), decision: last.decision });
+        found.extend(page.iter().map(|row| row.decision));
+    }
+}
+
 /// Decisions on the candidates of a state, read in pages of `limit`.
 async fn of_state(
     store: &Store,
@@ -102,18 +121,7 @@ async fn of_state(
     order: (ListOrder, bool),
     limit: u32,
 ) -> Vec<i64> {
-    let (mut found, mut after) = (Vec::new(), None);
-    loop {
-        let page = store.list_state(state, origin, order, after, limit).await.unwrap();
-        let Some(last) = page.last() else { return found };
-        let value = match order.0 {
-            ListOrder::Decision => None,
-            ListOrder::Gamma => last.gamma,
-            ListOrder::Volume => last.relative_volume,
-        };
-        after = Some(ListCursor { priority: 0, value: value.unwrap_or_default(), decision: last.decision });
-        found.extend(page.iter().map(|row| row.decision));
-    }
+    in_pages(order.0, async |after| store.list_state(state, origin, order, after, limit).await).await
 }
 
 #[tokio::test]
@@ -188,4 +196,148 @@ async fn candidates_within_limits_are_those_of_all_within_them() {
     }
     assert!(numbers[..18].iter().filter(|number| **number > 0).count() > 12, "{numbers:?}");
     assert!(numbers[18..].iter().all(|number| *number == 0), "{numbers:?}");
+}
+
+/// Thousands of candidates with jobs, and then as many without.
+#[tokio::test]
+async fn candidates_of_a_state_with_many_jobs_are_found_near_and_far() {
+    let database = TestDatabase::new();
+    let store = database.create().await.with_caller_clock();
+    for (walk, fate) in [(0, Fate::Accepted), (1, Fate::Declined(DeclineReason::Covered))] {
+        let records = (1..=4100).map(|step| {
+            let mut found = candidate(walk, step, Origin::Biased, fate);
+            found.original.gamma[0] = 1.0 + 0.001 * (7 * step % 1000) as f64;
+            found
+        });
+        store.commit(&commit_of(records.collect())).await.unwrap();
+    }
+    assert!(store.has_more_jobs(JobState::Queued, 4000).await.unwrap());
+    for order in [ListOrder::Decision, ListOrder::Gamma, ListOrder::Volume] {
+        for order in [(order, true), (order, false)] {
+            let all = store.list_candidates(order.0, order.1, None, 9999).await.unwrap();
+            for start in [0, 999, 2500, 4000] {
+                let after = all[..start].last().map(|row| ListCursor {
+                    priority: 0,
+                    value: if order.0 == ListOrder::Gamma { row.gamma } else { row.relative_volume }.unwrap(),
+                    decision: row.decision,
+                });
+                let queued = all[start..].iter().filter(|row| row.job_state.is_some()).take(200);
+                let found = store.list_state(JobState::Queued, None, order, after, 200).await.unwrap();
+                assert!(found.iter().eq(queued), "{order:?} from {start}");
+            }
+        }
+    }
+}
+
+/// γ₀_max and V/V₀ of candidates by step: not known, not finite, and equal ones.
+const VALUES: [(Option<f64>, Option<f64>); 12] = [
+    (Some(1.5), Some(1.1)),
+    (None, Some(1.2)),
+    (Some(1.5), None),
+    (Some(2.0), Some(0.9)),
+    (None, None),
+    (Some(f64::INFINITY), Some(1.1)),
+    (Some(0.5), Some(f64::INFINITY)),
+    (Some(1.5), Some(1.1)),
+    (None, Some(1.0)),
+    (Some(2.5), Some(1.2)),
+    (Some(1.0), None),
+    (Some(2.0), Some(1.3)),
+];
+
+/// Candidates with these values, of which every second has a job.
+async fn with_missing_values(store: &Store) {
+    for (step, (gamma, volume)) in (1..).zip(VALUES) {
+        let declined = Fate::Declined(DeclineReason::Covered);
+        let fate = if step % 2 == 1 { Fate::Accepted } else { declined };
+        let mut found = candidate(0, step, Origin::Biased, fate);
+        found.original.gamma = match gamma {
+            Some(gamma) => vec![gamma, 0.1],
+            // Without grades, or with unknown ones.
+            None if step == 2 => Vec::new(),
+            None => vec![f64::NAN; ATOMS],
+        };
+        found.original.gamma_nbr.truncate(found.original.gamma.len());
+        let block = found.block.view().to_candidate();
+        let relative_volume = volume.unwrap_or(f64::NAN);
+        found.block = CandidateBlock::encode(&Candidate { relative_volume, ..block });
+        store.commit(&commit_of(vec![found])).await.unwrap();
+    }
+}
+
+/// An order has those with a finite value, in both directions; pages may begin and end anywhere, also between equal values.
+#[tokio::test]
+async fn orders_leave_out_candidates_without_a_value() {
+    let database = TestDatabase::new();
+    let store = database.create().await;
+    with_missing_values(&store).await;
+    for (order, value) in [
+        (ListOrder::Gamma, VALUES.map(|(gamma, _)| gamma)),
+        (ListOrder::Volume, VALUES.map(|(_, volume)| volume)),
+    ] {
+        let known =
+            (1_i64..).zip(value).filter_map(|(place, value)| Some((value.filter(|x| x.is_finite())?, place)));
+        let mut sorted: Vec<_> = known.collect();
+        sorted.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        for descending in [false, true] {
+            let expected: Vec<i64> = match descending {
+                true => sorted.iter().rev().map(|(_, place)| *place).collect(),
+                false => sorted.iter().map(|(_, place)| *place).collect(),
+            };
+            let queued: Vec<_> = expected.iter().copied().filter(|place| place % 2 == 1).collect();
+            assert!(expected.len() == 8 && !queued.is_empty());
+            for limit in [1, 2, 3, 8, 99] {
+                let read = async |after| store.list_candidates(order, descending, after, limit).await;
+                assert_eq!(in_pages(order, read).await, expected, "{order:?} {descending} by {limit}");
+                let found = of_state(&store, JobState::Queued, None, (order, descending), limit).await;
+                assert_eq!(found, queued, "{order:?} {descending} by {limit}");
+            }
+        }
+    }
+    // Decisions have all.
+    let read = async |after| store.list_candidates(ListOrder::Decision, true, after, 5).await;
+    assert_eq!(in_pages(ListOrder::Decision, read).await, (1..=12).rev().collect::<Vec<_>>());
+}
+
+/// Candidates without a value are outside of its limits, and limits of the other value do not concern them.
+#[tokio::test]
+async fn candidates_without_a_value_are_outside_of_its_limits() {
+    let database = TestDatabase::new();
+    let store = database.create().await;
+    with_missing_values(&store).await;
+    for (gamma, relative_volume, expected) in [
+        ([Some(0.0), None], [None; 2], &[1, 3, 4, 6, 7, 8, 10, 11, 12][..]),
+        ([None, Some(1.5)], [None; 2], &[1, 3, 7, 8, 11]),
+        ([None; 2], [Some(1.1), Some(1.2)], &[1, 2, 6, 8, 10]),
+        ([None; 2], [Some(0.0), None], &[1, 2, 4, 6, 7, 8, 9, 10, 12]),
+        ([Some(1.5), Some(1.5)], [Some(1.0), None], &[1, 8]),
+    ] {
+        let limits = ListLimits { gamma, relative_volume };
+        for fate in [None, Some(("biased", None)), Some(("biased", Some("covered"))), Some(("control", None))]
+        {
+            let of_fate = |place: &i64| match fate {
+                None => true,
+                Some(("biased", None)) => place % 2 == 1,
+                Some((origin, _)) => origin == "biased" && place % 2 == 0,
+            };
+            let expected: Vec<_> = expected.iter().copied().filter(of_fate).collect();
+            let number = store.candidates_of_fate("biased", Some("covered")).await.unwrap();
+            assert_eq!(number, Some(6));
+            for limit in [1, 2, 99] {
+                let upwards = async |after: Option<ListCursor>| {
+                    let begin = after.map_or(1, |place| place.decision + 1);
+                    store.list_within(begin..13, limits, fate, false, limit).await
+                };
+                let found = in_pages(ListOrder::Decision, upwards).await;
+                assert_eq!(found, expected, "{limits:?} {fate:?} by {limit}");
+                let downwards = async |after: Option<ListCursor>| {
+                    let end = after.map_or(13, |place| place.decision);
+                    store.list_within(1..end, limits, fate, true, limit).await
+                };
+                let mut found = in_pages(ListOrder::Decision, downwards).await;
+                found.reverse();
+                assert_eq!(found, expected, "{limits:?} {fate:?} by {limit}, downwards");
+            }
+        }
+    }
 }

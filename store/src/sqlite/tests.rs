@@ -116,10 +116,19 @@ async fn frequent_queries_use_indexes() {
         listing::LARGEST_VOLUME_OF_STATE,
         listing::SMALLEST_VOLUME_OF_STATE,
     ] {
-        let page = plan(&file, sql).await.replace("SCAN page", "");
+        let page = plan(&file, sql.all).await.replace("SCAN page", "");
         assert!(page.contains("SEARCH job USING INDEX job_order (state=?)"), "{page}");
         assert!(page.contains("SEARCH candidate USING INDEX candidate_structure"), "{page}");
         assert!(!page.contains("SCAN"), "{page}");
+        // A bounded number of rows of an index, in its order.
+        let near = plan(&file, sql.near).await.replace("SCAN page", "").replace("SCAN candidate\n", "");
+        assert!(near.contains("SEARCH candidate USING I"), "{near}");
+        assert!(!near.contains("SCAN"), "{near}");
+    }
+    for sql in [listing::NEWEST_WITHIN_FATE, listing::OLDEST_WITHIN_FATE] {
+        let page = plan(&file, sql).await.replace("SCAN page", "");
+        let index = "SEARCH candidate USING INDEX candidate_fate (origin=? AND fate=? AND reason=? AND rowid>? AND rowid<?)";
+        assert!(page.contains(index) && !page.contains("SCAN"), "{page}");
     }
     for sql in [listing::NEWEST_WITHIN, listing::OLDEST_WITHIN] {
         let page = plan(&file, sql).await.replace("SCAN page", "");

@@ -97,21 +97,28 @@ pub(crate) const OLDEST_OF_FATE: &str = page!(
     "$5"
 );
 
+// In both directions, the order has the finite values.
 pub(crate) const LARGEST_GAMMA: &str = page!(
     "(original_gamma, candidate.decision) < ($1, $2)",
     "original_gamma DESC, candidate.decision DESC",
     "$3"
 );
-pub(crate) const SMALLEST_GAMMA: &str =
-    page!("(original_gamma, candidate.decision) > ($1, $2)", "original_gamma, candidate.decision", "$3");
+pub(crate) const SMALLEST_GAMMA: &str = page!(
+    "(original_gamma, candidate.decision) > ($1, $2) AND original_gamma <= 1.7976931348623157e308",
+    "original_gamma, candidate.decision",
+    "$3"
+);
 
 pub(crate) const LARGEST_VOLUME: &str = page!(
     "(relative_volume, candidate.decision) < ($1, $2)",
     "relative_volume DESC, candidate.decision DESC",
     "$3"
 );
-pub(crate) const SMALLEST_VOLUME: &str =
-    page!("(relative_volume, candidate.decision) > ($1, $2)", "relative_volume, candidate.decision", "$3");
+pub(crate) const SMALLEST_VOLUME: &str = page!(
+    "(relative_volume, candidate.decision) > ($1, $2) AND relative_volume <= 1.7976931348623157e308",
+    "relative_volume, candidate.decision",
+    "$3"
+);
 
 /// Candidates of a walk, ordered by name.
 pub(crate) const OF_WALK: &str = page!("id >= $1 AND id < $1 || '~'", "id", "$2");
@@ -135,51 +142,86 @@ macro_rules! decided_of_walk {
 pub(crate) const NEWEST_OF_WALK: &str = decided_of_walk!("<", " DESC");
 pub(crate) const OLDEST_OF_WALK: &str = decided_of_walk!(">", "");
 
-/// The jobs of a state lead to their candidates: all of them are read. An origin of NULL stands for both.
+/// Candidates whose newest job has the state `$1`, found in two ways. An origin of NULL stands for both.
+pub(crate) struct OfState {
+    /// Searches the first candidates of the order.
+    pub near: &'static str,
+    /// The jobs of the state lead to their candidates: all of them are read.
+    pub all: &'static str,
+}
+
 macro_rules! of_state {
     ($which:literal, $order:literal) => {
-        lines!(
-            "FROM (SELECT candidate.decision AS place FROM job
-                CROSS JOIN candidate ON candidate.structure = job.structure
-                WHERE job.state = $1 AND ($2 IS NULL OR origin = $2)
-                AND NOT EXISTS (SELECT 1 FROM job AS newer
-                                WHERE newer.structure = job.structure AND newer.number > job.number)
-                AND ",
-            $which,
-            " ORDER BY ",
-            $order,
-            " LIMIT $3) AS page CROSS JOIN candidate ON candidate.decision = place",
-            joins!(),
-            " ORDER BY ",
-            $order
-        )
+        OfState {
+            near: lines!(
+                "FROM (SELECT decision AS place
+                    FROM (SELECT decision, structure, origin, original_gamma, relative_volume FROM candidate WHERE ",
+                $which,
+                " ORDER BY ",
+                $order,
+                " LIMIT 4000) AS candidate
+                    WHERE ($2 IS NULL OR origin = $2)
+                    AND EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure AND job.state = $1
+                                AND NOT EXISTS (SELECT 1 FROM job AS newer
+                                                WHERE newer.structure = job.structure AND newer.number > job.number))
+                    ORDER BY ",
+                $order,
+                " LIMIT $3) AS page CROSS JOIN candidate ON candidate.decision = place",
+                joins!(),
+                " ORDER BY ",
+                $order
+            ),
+            all: lines!(
+                "FROM (SELECT candidate.decision AS place FROM job
+                    CROSS JOIN candidate ON candidate.structure = job.structure
+                    WHERE job.state = $1 AND ($2 IS NULL OR origin = $2)
+                    AND NOT EXISTS (SELECT 1 FROM job AS newer
+                                    WHERE newer.structure = job.structure AND newer.number > job.number)
+                    AND ",
+                $which,
+                " ORDER BY ",
+                $order,
+                " LIMIT $3) AS page CROSS JOIN candidate ON candidate.decision = place",
+                joins!(),
+                " ORDER BY ",
+                $order
+            ),
+        }
     };
 }
 
-pub(crate) const NEWEST_OF_STATE: &str = of_state!("candidate.decision < $4", "candidate.decision DESC");
-pub(crate) const OLDEST_OF_STATE: &str = of_state!("candidate.decision > $4", "candidate.decision");
-pub(crate) const LARGEST_GAMMA_OF_STATE: &str = of_state!(
+pub(crate) const NEWEST_OF_STATE: OfState = of_state!("candidate.decision < $4", "candidate.decision DESC");
+pub(crate) const OLDEST_OF_STATE: OfState = of_state!("candidate.decision > $4", "candidate.decision");
+pub(crate) const LARGEST_GAMMA_OF_STATE: OfState = of_state!(
     "(original_gamma, candidate.decision) < ($5, $4)",
     "original_gamma DESC, candidate.decision DESC"
 );
-pub(crate) const SMALLEST_GAMMA_OF_STATE: &str =
-    of_state!("(original_gamma, candidate.decision) > ($5, $4)", "original_gamma, candidate.decision");
-pub(crate) const LARGEST_VOLUME_OF_STATE: &str = of_state!(
+pub(crate) const SMALLEST_GAMMA_OF_STATE: OfState = of_state!(
+    "(original_gamma, candidate.decision) > ($5, $4) AND original_gamma <= 1.7976931348623157e308",
+    "original_gamma, candidate.decision"
+);
+pub(crate) const LARGEST_VOLUME_OF_STATE: OfState = of_state!(
     "(relative_volume, candidate.decision) < ($5, $4)",
     "relative_volume DESC, candidate.decision DESC"
 );
-pub(crate) const SMALLEST_VOLUME_OF_STATE: &str =
-    of_state!("(relative_volume, candidate.decision) > ($5, $4)", "relative_volume, candidate.decision");
+pub(crate) const SMALLEST_VOLUME_OF_STATE: OfState = of_state!(
+    "(relative_volume, candidate.decision) > ($5, $4) AND relative_volume <= 1.7976931348623157e308",
+    "relative_volume, candidate.decision"
+);
 
-/// A range of the table is read for the decisions; only the rows of the page with what belongs to them.
+/// With more jobs than this, fewer rows are read where [`OfState::near`] searches, which often fills a short page.
+const MANY_JOBS: u32 = 4000;
+const SHORT_PAGE: u32 = 200;
+
+/// A range of the table is read for the decisions, or of the index of fates; only the rows of the page with what belongs to them.
 macro_rules! within {
-    ($way:literal) => {
+    ($fate:literal, $way:literal) => {
         lines!(
             "FROM (SELECT decision AS place FROM candidate WHERE decision >= $1 AND decision < $2
-                AND ($4 IS NULL OR (origin = $4 AND fate = $5 AND reason IS NOT DISTINCT FROM $6))
-                AND ($7 IS NULL OR original_gamma >= $7) AND ($8 IS NULL OR original_gamma <= $8)
-                AND ($9 IS NULL OR relative_volume >= $9) AND ($10 IS NULL OR relative_volume <= $10)
-                ORDER BY decision",
+                AND ($4 IS NULL OR original_gamma >= $4) AND ($5 IS NULL OR original_gamma <= $5)
+                AND ($6 IS NULL OR relative_volume >= $6) AND ($7 IS NULL OR relative_volume <= $7)",
+            $fate,
+            " ORDER BY decision",
             $way,
             " LIMIT $3) AS page CROSS JOIN candidate ON candidate.decision = place",
             joins!(),
@@ -189,8 +231,16 @@ macro_rules! within {
     };
 }
 
-pub(crate) const NEWEST_WITHIN: &str = within!(" DESC");
-pub(crate) const OLDEST_WITHIN: &str = within!("");
+macro_rules! within_fate {
+    ($way:literal) => {
+        within!(" AND origin = $8 AND fate = $9 AND reason IS NOT DISTINCT FROM $10", $way)
+    };
+}
+
+pub(crate) const NEWEST_WITHIN: &str = within!("", " DESC");
+pub(crate) const OLDEST_WITHIN: &str = within!("", "");
+pub(crate) const NEWEST_WITHIN_FATE: &str = within_fate!(" DESC");
+pub(crate) const OLDEST_WITHIN_FATE: &str = within_fate!("");
 
 const MORE_JOBS_THAN: &str =
     "SELECT count(*) > $2 FROM (SELECT 1 AS one FROM job WHERE state = $1 LIMIT $2 + 1) AS found";
@@ -270,14 +320,23 @@ impl Store {
         descending: bool,
         limit: u32,
     ) -> Result<Vec<ListedCandidate>> {
-        let query = query(if descending { NEWEST_WITHIN } else { OLDEST_WITHIN });
-        let query = query.bind(decisions.start).bind(decisions.end).bind(limit);
-        let (origin, reason) = fate.unzip();
-        let reason = reason.flatten();
-        let fate = if reason.is_some() { "declined" } else { "accepted" };
-        let query = query.bind(origin).bind(fate).bind(reason);
+        let sql = match (fate.is_some(), descending) {
+            (false, true) => NEWEST_WITHIN,
+            (false, false) => OLDEST_WITHIN,
+            (true, true) => NEWEST_WITHIN_FATE,
+            (true, false) => OLDEST_WITHIN_FATE,
+        };
+        let query = query(sql).bind(decisions.start).bind(decisions.end).bind(limit);
         let values = limits.gamma.into_iter().chain(limits.relative_volume);
-        values.fold(query, |query, value| query.bind(value)).fetch_all(&self.database).await
+        let query = values.fold(query, |query, value| query.bind(value));
+        let query = match fate {
+            Some((origin, reason)) => {
+                let fate = if reason.is_some() { "declined" } else { "accepted" };
+                query.bind(origin).bind(fate).bind(reason)
+            }
+            None => query,
+        };
+        query.fetch_all(&self.database).await
     }
 
     /// The newest decision on a candidate; 0 without one.
@@ -286,7 +345,7 @@ impl Store {
     }
 
     /// At most `limit` candidates whose newest label job has a state, of one origin or (`None`) both, as
-    /// [`Self::list_candidates`]. Reads all jobs of that state.
+    /// [`Self::list_candidates`]. Reads all jobs of that state, unless there are many and a short page is found near the cursor.
     pub async fn list_state(
         &self,
         state: JobState,
@@ -304,9 +363,18 @@ impl Store {
             (ListOrder::Volume, true) => LARGEST_VOLUME_OF_STATE,
             (ListOrder::Volume, false) => SMALLEST_VOLUME_OF_STATE,
         };
-        let query = query(sql).bind(state.name()).bind(origin).bind(limit).bind(decision);
-        let query = if order == ListOrder::Decision { query } else { query.bind(value) };
-        query.fetch_all(&self.database).await
+        let rows = async |sql| {
+            let query = query(sql).bind(state.name()).bind(origin).bind(limit).bind(decision);
+            let query = if order == ListOrder::Decision { query } else { query.bind(value) };
+            query.fetch_all(&self.database).await
+        };
+        if limit <= SHORT_PAGE && self.has_more_jobs(state, MANY_JOBS).await? {
+            let near: Vec<_> = rows(sql.near).await?;
+            if near.len() == limit as usize {
+                return Ok(near);
+            }
+        }
+        rows(sql.all).await
     }
 
     /// Whether more than `number` label jobs have a state. Counts no further.

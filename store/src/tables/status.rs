@@ -28,7 +28,10 @@ pub(crate) const COUNTED_FATES: &str =
 pub(crate) const ACCEPTED: &str = "SELECT CAST(coalesce(sum(number), 0) AS BIGINT) FROM candidate_count
     WHERE origin = 'biased' AND fate = 'accepted'";
 
-/// The same, counted, for tables of an earlier version.
+const OF_FATE: &str = "SELECT CAST(coalesce(sum(number), 0) AS BIGINT) FROM candidate_count
+    WHERE origin = $1 AND fate = $2";
+
+/// The same as [`ACCEPTED`], counted, for tables of an earlier version.
 const COUNTED_ACCEPTED: &str = "SELECT count(*) FROM candidate WHERE origin = 'biased' AND fate = 'accepted'";
 
 /// The query for [`WalkStatus`]; its end selects the walks. The table has zeros before a walk starts and where it
@@ -131,6 +134,21 @@ impl Store {
         let accepted = accepted.fetch_one(&mut transaction).await?;
         transaction.commit().await?;
         Ok(accepted)
+    }
+
+    /// Number of candidates of an origin that were accepted, or declined for this reason. `None` if the tables of an earlier version
+    /// keep no counts.
+    pub async fn candidates_of_fate(&self, origin: &str, reason: Option<&str>) -> Result<Option<u64>> {
+        let mut transaction = self.database.begin_read().await?;
+        let number = match transaction.has_table("candidate_count").await? {
+            true => {
+                let sum = query(OF_FATE).bind(origin).bind(reason.unwrap_or("accepted"));
+                Some(sum.fetch_one(&mut transaction).await?)
+            }
+            false => None,
+        };
+        transaction.commit().await?;
+        Ok(number)
     }
 }
 

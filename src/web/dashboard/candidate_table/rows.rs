@@ -11,8 +11,8 @@ use crate::filter::{NumberField, StructureFilter};
 
 /// Up to this number of label jobs of a state, its candidates are found by them. With more, they are found among all candidates.
 const MAX_JOBS_OF_STATE: u32 = 100_000;
-/// Decisions that are searched at a time for candidates within limits.
-const SEARCHED_DECISIONS: i64 = 100_000;
+/// Candidates, of a fate if one is asked for, that are searched at a time for those within limits.
+const SEARCHED_CANDIDATES: u64 = 100_000;
 
 /// How rows are found.
 #[derive(Clone, Copy, Debug)]
@@ -21,8 +21,18 @@ pub(super) enum RowSource {
     Order,
     /// The label jobs of a state.
     State(JobState),
-    /// The decisions up to the newest, of which the store returns those within limits.
-    Limits(ListLimits, i64),
+    /// The decisions, of which the store returns those within limits.
+    Limits(LimitSearch),
+}
+
+/// A search for candidates within limits.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct LimitSearch {
+    limits: ListLimits,
+    /// The newest decision.
+    newest: i64,
+    /// Decisions that are searched at a time.
+    step: i64,
 }
 
 /// Rows that were read at once.
@@ -53,10 +63,15 @@ impl CandidateQuery {
             gamma: limits(NumberField::Gamma),
             relative_volume: limits(NumberField::RelativeVolume),
         };
-        match self.is_by_decision() && limits != ListLimits::default() {
-            true => Ok(RowSource::Limits(limits, store.newest_candidate().await?)),
-            false => Ok(RowSource::Order),
+        if !self.is_by_decision() || limits == ListLimits::default() {
+            return Ok(RowSource::Order);
         }
+        let newest = store.newest_candidate().await?;
+        let of_fate = match self.origin_and_reason() {
+            (Some(origin), reason) => store.candidates_of_fate(origin, reason).await?,
+            (None, _) => None,
+        };
+        Ok(RowSource::Limits(LimitSearch { limits, newest, step: search_step(newest, of_fate) }))
     }
 
     /// Whether rows that are read may be filtered out.
@@ -79,8 +94,8 @@ impl CandidateQuery {
         if self.state.is_some() && self.origin_and_reason().1.is_some() {
             return Ok(FoundRows { rows: Vec::new(), first: None, searched: 0, next: None });
         }
-        if let RowSource::Limits(limits, newest) = source {
-            return self.read_within(store, limits, newest, after, limit).await;
+        if let RowSource::Limits(search) = source {
+            return self.read_within(store, search, after, limit).await;
         }
         let rows = self.read_in_order(store, source, after, limit).await?;
         let is_full = rows.len() == limit as usize;
@@ -123,13 +138,12 @@ impl CandidateQuery {
     async fn read_within(
         &self,
         store: &Store,
-        limits: ListLimits,
-        newest: i64,
+        LimitSearch { limits, newest, step }: LimitSearch,
         after: Option<ListCursor>,
         limit: u32,
     ) -> Result<FoundRows, StoreError> {
         let (descending, after) = (self.is_descending(), after.map(|place| place.decision));
-        let decisions = next_decisions(descending, after, newest, SEARCHED_DECISIONS);
+        let decisions = next_decisions(descending, after, newest, step);
         let (origin, reason) = self.origin_and_reason();
         let fate = origin.map(|origin| (origin, reason));
         let rows = store.list_within(decisions.clone(), limits, fate, descending, limit).await?;
@@ -183,6 +197,13 @@ impl CandidateQuery {
     }
 }
 
+/// Number of decisions in which as many candidates as are searched at a time are expected, of those on `of_fate` candidates.
+fn search_step(newest: i64, of_fate: Option<u64>) -> i64 {
+    let expected = |number: u64| SEARCHED_CANDIDATES.saturating_mul(newest.unsigned_abs()) / number.max(1);
+    let step = of_fate.map_or(SEARCHED_CANDIDATES, expected).max(SEARCHED_CANDIDATES);
+    step.min(newest.unsigned_abs()).max(1).cast_signed()
+}
+
 /// At most `number` decisions up to the newest, behind one of them or from the first in this order on.
 fn next_decisions(descending: bool, after: Option<i64>, newest: i64, number: i64) -> Range<i64> {
     match (descending, after) {
@@ -234,6 +255,22 @@ mod tests {
                 let range = next_decisions(descending, Some(after), 7, 2);
                 assert!(range.start >= 1 && range.end <= 8, "{range:?}");
             }
+        }
+    }
+
+    #[test]
+    fn rare_fates_are_searched_in_larger_steps() {
+        for (newest, of_fate, step) in [
+            (0, None, 1),
+            (70, None, 70),
+            (70, Some(0), 70),
+            (1_000_000, None, 100_000),
+            (1_000_000, Some(1_000_000), 100_000),
+            (1_000_000, Some(500_000), 200_000),
+            (1_000_000, Some(1000), 1_000_000),
+            (i64::MAX, Some(0), i64::MAX),
+        ] {
+            assert_eq!(search_step(newest, of_fate), step, "{newest} {of_fate:?}");
         }
     }
 }
