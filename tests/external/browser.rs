@@ -2,6 +2,8 @@
 //! other site is contacted, the console has no errors, and actions work. Needs Debian's packages chromium and
 //! chromium-driver; `cargo test --test external browser::`. Saves screenshots in `target/dashboard`.
 
+mod states;
+
 use std::fs;
 use std::path::Path;
 use std::process::Stdio;

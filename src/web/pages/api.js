@@ -5,7 +5,17 @@ const POLL_INTERVAL = 500;
 
 /** Returns the response as JSON. Throws an Error with the message of a failure. */
 export async function fetchJson(path, signal) {
-  return parseResponse(await fetch(path, { signal, cache: "no-store" }));
+  return parseResponse(await reach(path, { signal, cache: "no-store" }));
+}
+
+/** As `fetch`; a connection that is lost has an error that says so. */
+export async function reach(path, options) {
+  try {
+    return await fetch(path, options);
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new Error("no connection to the program that serves this page");
+  }
 }
 
 /** Requests a result that takes long to compute, until it is ready. */
@@ -21,7 +31,7 @@ export async function fetchComputed(path, signal) {
 /** Performs the action at this path. */
 export async function postAction(path, token, what) {
   const headers = { "content-type": "application/json", "x-calmwalk-token": token };
-  return parseResponse(await fetch(path, { method: "POST", headers, body: JSON.stringify(what) }));
+  return parseResponse(await reach(path, { method: "POST", headers, body: JSON.stringify(what) }));
 }
 
 async function parseResponse(response) {

@@ -1,6 +1,6 @@
 // The table of candidates. The program sorts, filters and pages; this script shows one page.
 
-import { fetchJson } from "./api.js";
+import { fetchJson, reach } from "./api.js";
 import { FATES } from "./colours.js";
 import { element, renew, state, titleOf, words } from "./dom.js";
 import { decimals, labelValue, shortName, whole } from "./format.js";
@@ -95,7 +95,7 @@ function tools(params, change, signal) {
       const query = asked(params);
       // The order of a column without an index is not that of a file.
       if (!["decision", "gamma", "relative_volume", "queue"].includes(query.get("order") ?? "decision")) ["order", "ascending"].forEach((key) => query.delete(key));
-      const response = await fetch(`/api/candidates.extxyz?${query}`, { signal });
+      const response = await reach(`/api/candidates.extxyz?${query}`, { signal });
       if (!response.ok) throw new Error((await response.json().catch(() => ({}))).error ?? `status ${response.status}`);
       const address = URL.createObjectURL(await response.blob());
       element("a", { href: address, download: "candidates.extxyz" }).click();

@@ -70,7 +70,7 @@ impl CandidateQuery {
                     || ApiError::bad_request(format!("state is '{value}', expected a state of label jobs"));
                 self.state = Some(JobState::named(value).ok_or_else(unknown)?);
             }
-            "where" => self.filter = Some(value.parse().map_err(ApiError::bad_request)?),
+            "where" => self.filter = Some(filter(value)?),
             "after" => self.after = Some(value.parse()?),
             "limit" => {
                 let wrong =
@@ -90,6 +90,18 @@ impl CandidateQuery {
             _ => None,
         }
     }
+}
+
+/// The filter of this text, if the table has the properties that it names.
+fn filter(text: &str) -> Result<StructureFilter, ApiError> {
+    let filter: StructureFilter = text.parse().map_err(ApiError::bad_request)?;
+    // Such a comparison would be false for all candidates.
+    if filter.names().contains(&"fragments") {
+        return Err(ApiError::bad_request(
+            "the table does not know 'fragments', which needs positions: use calmwalk export --where",
+        ));
+    }
+    Ok(filter)
 }
 
 impl FromStr for TableOrder {
@@ -164,6 +176,7 @@ mod tests {
             ("order=atoms&after=2.5:17:10", "of another order"),
             ("order=gamma&after=rows:2", "of another order"),
             ("where=gamma", "expected one of = != <"),
+            ("where=gamma+%3E+1+or+not+fragments+%3D+1", "does not know 'fragments'"),
             ("sort=gamma", "unknown parameter 'sort'"),
         ] {
             let refused = format!("{:?}", CandidateQuery::parse(query).unwrap_err());
