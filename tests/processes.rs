@@ -307,8 +307,11 @@ fn clean_removes_what_killed_processes_left_and_nothing_else() {
     wait_until("all processes have exited", || processes_in(here).is_empty());
     let place = wire::shm_dir::ShmDir::for_campaign(here).unwrap();
     assert!(place.directory().exists());
+    let dry = succeed(here, ["clean", ".", "--dry-run"]);
+    assert!(place.directory().exists());
     let said = succeed(here, ["clean", "."]);
     assert!(said.contains("files from shared memory") && !said.contains(" 0 files"), "{said}");
+    assert_eq!(dry, said.replace("removed", "would remove") + "nothing was changed\n");
     assert_no_leftovers(here);
 }
 

@@ -37,6 +37,24 @@ pub(super) fn remove_tree(path: &Path, removed: &mut Removed) -> Result<(), ShmD
     }
 }
 
+/// Adds what [`remove_tree`] would remove.
+pub(super) fn count_tree(path: &Path, found: &mut Removed) -> Result<(), ShmDirError> {
+    match path.symlink_metadata() {
+        Ok(this) if this.is_dir() => entries(path)?.iter().try_for_each(|entry| count_tree(entry, found)),
+        Ok(_) => {
+            count_file(path, found);
+            Ok(())
+        }
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        Err(error) => Err(io_error("inspect", path)(error)),
+    }
+}
+
+pub(super) fn count_file(path: &Path, found: &mut Removed) {
+    found.files += 1;
+    found.bytes += 512 * path.symlink_metadata().map_or(0, |file| file.blocks());
+}
+
 pub(super) fn remove_file(path: &Path, removed: &mut Removed) -> Result<(), ShmDirError> {
     let blocks = path.symlink_metadata().map_or(0, |file| file.blocks());
     ignore_not_found(fs::remove_file(path)).map_err(io_error("remove", path))?;

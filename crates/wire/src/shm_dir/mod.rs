@@ -30,7 +30,7 @@ pub use error::ShmDirError;
 pub use files::Removed;
 
 use error::io_error;
-use files::{entries, remove_file, remove_tree};
+use files::{count_file, count_tree, entries, remove_file, remove_tree};
 use lock::{DirLock, UserLock};
 use private::{SHARED_MEMORY, create_private, user, user_root};
 
@@ -158,6 +158,20 @@ impl ShmDir {
     pub fn remove(&self) -> Result<Removed, ShmDirError> {
         let _user_lock = UserLock::wait()?;
         self.wipe()
+    }
+
+    /// What [`Self::remove`] would remove.
+    ///
+    /// # Errors
+    /// As [`Self::remove`].
+    pub fn removable(&self) -> Result<Removed, ShmDirError> {
+        let (_user_lock, mut found) = (UserLock::wait()?, Removed::default());
+        if self.directory.symlink_metadata().is_ok() {
+            let _lock = self.lock()?;
+            count_tree(&self.directory, &mut found)?;
+        }
+        segments(&self.prefix)?.iter().for_each(|path| count_file(path, &mut found));
+        Ok(found)
     }
 
     fn lock(&self) -> Result<DirLock, ShmDirError> {
