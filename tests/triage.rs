@@ -125,6 +125,14 @@ fn seed_structures_are_graded_and_measured() {
         (number("cubic", "distance") - 2.8).abs() < 1e-9 && (number("cubic", "limit") - 2.1).abs() < 1e-9
     );
 
+    let valid: Value = serde_json::from_str(&succeed(here, ["validate", "campaign.toml", "--json"])).unwrap();
+    let found = valid["seed_structures"].as_array().unwrap();
+    assert!(
+        found.iter().all(|one| one["state"] == text(one["seed_structure"].as_str().unwrap(), "state")),
+        "{valid}"
+    );
+    assert_eq!((found.len(), &valid["skipped"][0]["seed_structure"]), (5, &Value::from("close")));
+
     // Times per step scale with atoms and neighbours.
     let work = |name: &str| number(name, "atoms") * (1.0 + number(name, "neighbours_per_atom"));
     for hours in ["walk_hours", "control_hours"] {

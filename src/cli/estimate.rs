@@ -10,7 +10,7 @@ use monitor::label_cost::{CoreHours, CostEstimator};
 use serde_json::json;
 use store::{Location, Store};
 
-use super::seed_structure_table::SeedStructureTable;
+use super::seed_structure_table::{SeedStructureTable, skipped_json, walk_hours};
 use super::{CommandError, ExitStatus, block_on, campaign_location};
 use crate::campaign::{LoadedCampaign, SkippedStructure, WalkTime};
 use crate::disk_forecast;
@@ -241,25 +241,18 @@ fn write_labels(
 
 fn as_json(estimate: &CampaignEstimate<'_>) -> serde_json::Value {
     let triage: HashMap<_, _> = estimate.table.to_json().into_iter().collect();
-    let hours = |walks: Option<WalkTime>| {
-        walks.map(|time| json!({ "biased": time.biased / 3600.0, "control": time.control / 3600.0 }))
-    };
     let of_seed = |seed: &SeedStructureEstimate| {
         let CostPredictors { atoms, electrons, k_points } = seed.size;
         json!({
             "seed_structure": seed.name, "labels": seed.labels, "atoms": atoms, "electrons": electrons,
-            "k_points": k_points, "core_hours_each": seed.cost_per_label, "walk_hours": hours(seed.walks),
+            "k_points": k_points, "core_hours_each": seed.cost_per_label, "walk_hours": walk_hours(seed.walks),
             "triage": triage.get(seed.name.as_str()),
         })
     };
-    let skipped = |of: &SkippedStructure| {
-        let SkippedStructure { plan, source, reason } = of;
-        json!({ "seed_structure": plan.name, "source": source, "reason": reason })
-    };
     json!({
         "labels": estimate.labels, "limited_by": estimate.limited_by, "core_hours": estimate.cost,
-        "walk_hours": hours(estimate.walks), "disk": estimate.disk,
+        "walk_hours": walk_hours(estimate.walks), "disk": estimate.disk,
         "seed_structures": estimate.seed_structures.iter().map(of_seed).collect::<Vec<_>>(),
-        "skipped": estimate.skipped.iter().map(skipped).collect::<Vec<_>>(),
+        "skipped": estimate.skipped.iter().map(skipped_json).collect::<Vec<_>>(),
     })
 }

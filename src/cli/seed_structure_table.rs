@@ -171,6 +171,17 @@ impl<'a> SeedStructureTable<'a> {
     }
 }
 
+/// Times of walks in hours.
+pub fn walk_hours(walks: Option<WalkTime>) -> Option<Value> {
+    let hours = |seconds: f64| seconds / SECONDS_PER_HOUR;
+    walks.map(|time| json!({ "biased": hours(time.biased), "control": hours(time.control) }))
+}
+
+/// A seed structure that was skipped, and why.
+pub fn skipped_json(SkippedStructure { plan, source, reason }: &SkippedStructure) -> Value {
+    json!({ "seed_structure": plan.name, "source": source, "reason": reason })
+}
+
 /// A remark in words.
 fn words(remark: &Remark) -> String {
     match remark {

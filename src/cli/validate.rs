@@ -4,12 +4,14 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use calm::Artifact;
+use serde_json::{Value, json};
 
-use super::seed_structure_table::SeedStructureTable;
+use super::seed_structure_table::{SeedStructureTable, skipped_json, walk_hours};
 use super::{CommandError, ExitStatus};
 use crate::campaign::{LoadedCampaign, PairRange};
+use crate::config::Warning;
 use crate::disk_forecast;
-use crate::output::{TextTable, count, decimals, print};
+use crate::output::{TextTable, count, decimals, print, print_json};
 use crate::runtime;
 use crate::wording;
 
@@ -35,6 +37,9 @@ pub struct ValidateArgs {
     /// Write a table of all seed structures, including skipped ones, with the distances of all pairs of elements to this file
     #[arg(long, value_name = "FILE.csv")]
     csv: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
 }
 
 impl ValidateArgs {
@@ -42,6 +47,10 @@ impl ValidateArgs {
         let campaign = LoadedCampaign::load(&self.config)?;
         campaign.print_warnings();
         let seeds = SeedStructureTable::examine(&campaign, self.csv.as_deref())?;
+        if self.json {
+            print_json(&as_json(&campaign, &seeds))?;
+            return Ok(ExitStatus::Done);
+        }
         let shown = if self.all { usize::MAX } else { SHOWN };
         print(|out| {
             write(out, &self.config, &campaign)?;
@@ -52,6 +61,24 @@ impl ValidateArgs {
         })?;
         Ok(ExitStatus::Done)
     }
+}
+
+fn as_json(campaign: &LoadedCampaign, seeds: &SeedStructureTable<'_>) -> Value {
+    let LoadedCampaign { model, artifact: Artifact { mixture, .. }, warnings, skipped, .. } = campaign;
+    let warning =
+        |Warning { at, key, message }: &Warning| json!({ "at": at, "key": key, "message": message });
+    let triage = |(name, mut found): (&str, Value)| {
+        found["seed_structure"] = name.into();
+        found
+    };
+    json!({
+        "elements": model.elements().iter().map(|species| species.symbol()).collect::<Vec<_>>(),
+        "cutoff": model.cutoff(), "components": mixture.iter().count(), "feature_dimension": mixture.dimension(),
+        "protocol": campaign.protocol.name, "warnings": warnings.iter().map(warning).collect::<Vec<_>>(),
+        "seed_structures": seeds.to_json().into_iter().map(triage).collect::<Vec<_>>(),
+        "skipped": skipped.iter().map(skipped_json).collect::<Vec<_>>(),
+        "walk_hours": walk_hours(seeds.total_walk_time()), "disk": disk_forecast::estimate(campaign),
+    })
 }
 
 /// How many seed structures are noteworthy, how long walks take, and whether walkers wait.
