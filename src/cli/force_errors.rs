@@ -233,7 +233,7 @@ fn write_bins(out: &mut dyn Write, name: &str, bins: &[ErrorBin]) -> io::Result<
         ">without label",
         ">possible (%)",
     ]);
-    for bin in bins {
+    for bin in bins.iter().filter(|bin| bin.atoms > 0 || bin.unlabelled > 0) {
         let percent = |share: f64| format!("{:.1}", 100.0 * share);
         let possible =
             bin.large_between.map(|(least, most)| format!("{} to {}", percent(least), percent(most)));
@@ -256,7 +256,7 @@ fn write_bins(out: &mut dyn Write, name: &str, bins: &[ErrorBin]) -> io::Result<
 fn write_completion(out: &mut dyn Write, name: &str, bins: &[CompletionBin<String>]) -> io::Result<()> {
     let mut table =
         TextTable::new(&[name, ">attempted", ">labelled", ">share (%)", ">95 %", "failed (without label)"]);
-    for bin in bins {
+    for bin in bins.iter().filter(|bin| bin.labelled > 0 || !bin.failed.is_empty()) {
         let percent = |share: f64| format!("{:.0}", 100.0 * share);
         let interval = bin.interval.map(|(low, high)| format!("{} to {}", percent(low), percent(high)));
         let more = bin.failed.len().saturating_sub(NAMES);

@@ -51,7 +51,11 @@ pub fn expected(found: &ExpectedErrors) -> Vec<String> {
     let chosen = if *by_value { " chosen by value" } else { "" };
     let labelled = format!("{}{chosen}", count(*structures, "labelled structure"));
     let Some(bound) = worst.bound else {
-        return vec![format!("unknown for {atom}: too few of {labelled} have atoms in its bin of γ_nbr")];
+        let why = match structures {
+            0 => "no structure was labelled before".to_owned(),
+            _ => format!("too few of {labelled} have atoms in its bin of γ_nbr"),
+        };
+        return vec![format!("unknown for {atom}: {why}")];
     };
     let when = if worst.error.is_some() { " before its own label" } else { "" };
     let level = percent(*level);
@@ -174,6 +178,8 @@ mod tests {
         found.held = None;
         assert_eq!(expected(&found).len(), 1);
         found.worst.bound = None;
-        assert!(expected(&found)[0].starts_with("unknown for atom 3 (Al)"));
+        assert!(expected(&found)[0].starts_with("unknown for atom 3 (Al), γ_nbr 2.500: too few of 40 "));
+        found.structures = 0;
+        assert!(expected(&found)[0].ends_with(": no structure was labelled before"));
     }
 }
