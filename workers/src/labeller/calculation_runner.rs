@@ -213,6 +213,20 @@ fn exec_program(runner: u32, directory: &Path, command: &[String]) -> io::Error 
 }
 
 impl Calculation {
+    /// One hour of a program with 2 GB, for tests of what runs it.
+    #[cfg(test)]
+    pub(super) fn example(directory: &Path, runner: RunnerCommand) -> Self {
+        Self {
+            directory: directory.to_owned(),
+            command: vec!["abinit".to_owned()],
+            environment: Vec::new(),
+            pass_environment: PassedEnvironment::default(),
+            time_limit: 3600.0,
+            memory_limit: Some(2_000_000_000),
+            runner,
+        }
+    }
+
     /// Starts the program, waits for it, and ends it at a limit.
     fn run(self) -> io::Result<()> {
         if !private_directory::is_own(&self.directory) {

@@ -12,7 +12,7 @@ use tracing::warn;
 
 use super::calculation_runner::{self, Calculation, CalculationEnd, RunnerRequest};
 use super::calculation_state::CalculationState;
-use super::remove_tree::remove_tree;
+use super::removal::remove_directory;
 use super::{private_directory, process_tree};
 
 /// Initial time between two checks of a calculation.
@@ -116,7 +116,7 @@ pub(super) fn clear(directory: &Path) -> io::Result<()> {
 pub(super) fn remove(directory: &Path) {
     if fs::symlink_metadata(directory).is_ok() && !private_directory::is_own(directory) {
         warn!("not removing {}: it is not a directory of this user", directory.display());
-    } else if let Err(error) = remove_tree(directory) {
+    } else if let Err(error) = remove_directory(directory) {
         warn!("cannot remove {}: {error}", directory.display());
     }
 }

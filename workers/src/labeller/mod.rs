@@ -30,6 +30,7 @@ mod private_directory;
 mod process_tree;
 mod recorded_label;
 mod reference;
+mod removal;
 mod remove_tree;
 mod report_line;
 mod retry;

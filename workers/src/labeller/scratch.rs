@@ -3,7 +3,7 @@
 //! | | |
 //! | --- | --- |
 //! | `<scratch>/calmwalk-<campaign>-<random>/` | directory of a campaign, for this user alone (see [`private_directory`]); later labellers find it by name and owner |
-//! | `<scratch>/calmwalk-<campaign>-<random>/<job>-<attempt>-<time>/` | directory of a calculation, with the folders `work` and `data` |
+//! | `<scratch>/calmwalk-<campaign>-<random>/<job>-<attempt>-<time>/` | directory of a calculation, with the folders `work` and `data`; with `-removed` at its end while it is removed |
 
 use std::fs;
 use std::io;
@@ -20,6 +20,7 @@ use super::calculation_handle::CalculationHandle;
 use super::calculation_state::CalculationState;
 use super::execution::KeepDirectories;
 use super::file_error::file_error;
+use super::removal::is_being_removed;
 use super::slurm;
 use super::{local, pack, private_directory, retry_until_written};
 
@@ -75,7 +76,7 @@ impl ScratchRoot {
     }
 
     /// Removes directories that killed labellers left and that are not needed: those of calculations whose runner has
-    /// ended and whose result is not wanted.
+    /// ended and whose result is not wanted, and those of which they had begun to remove.
     pub async fn cleanup(
         &self,
         store: &Store,
@@ -144,6 +145,11 @@ async fn cleanup_one(
     stop: &CancellationToken,
 ) -> Result<(), StoreError> {
     let Some((job, attempt)) = job_and_attempt(directory) else { return Ok(()) };
+    if is_being_removed(directory) {
+        let left = directory.to_owned();
+        blocking(move || local::remove(&left)).await;
+        return Ok(());
+    }
     let past = retry_until_written(stop, || store.past_calculation(job, attempt)).await?;
     // Otherwise it belongs to a copy of this campaign.
     let Some(past) = past.filter(|past| !past.wanted) else { return Ok(()) };

@@ -1,7 +1,8 @@
 //! Kills and stops labellers, runners and programs.
 
-use std::fs;
-use std::time::Duration;
+use std::fs::{self, File, Permissions};
+use std::os::unix::fs::PermissionsExt;
+use std::time::{Duration, SystemTime};
 
 use store::{JobState, unix_milliseconds};
 
@@ -173,4 +174,24 @@ async fn a_calculation_whose_directory_is_removed_ends() {
     labeller.kill(&fixture).await;
     fixture.directories().iter().for_each(|directory| fs::remove_dir_all(directory).unwrap());
     until("its processes do not end", async || fixture.processes().is_empty()).await;
+}
+
+/// A labeller that is killed while it removes a directory leaves a part of it, under another name.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_is_left_of_a_removal_is_removed_by_the_next_labeller() {
+    let fixture = Fixture::new(1, "echo -7.5 > energy").await;
+    let campaign = fixture.store.campaign().await.unwrap().id;
+    let root = fixture.running.scratch().join(format!("calmwalk-{campaign}-0"));
+    let [left, unknown] = ["1-1-0-removed", "1-1-0"].map(|name| root.join(name));
+    for directory in [&left, &unknown] {
+        fs::create_dir_all(directory.join("work/deep")).unwrap();
+        fs::write(directory.join("order.json"), "").unwrap();
+        let long_ago = SystemTime::now() - Duration::from_secs(100);
+        File::open(directory).unwrap().set_modified(long_ago).unwrap();
+    }
+    fs::set_permissions(&root, Permissions::from_mode(0o700)).unwrap();
+    fixture.work().await;
+    // The other one may be a copy's: this campaign knows of no such attempt yet.
+    assert_eq!(fixture.directories(), [unknown]);
+    assert_eq!(fixture.labels().await.len(), 1);
 }

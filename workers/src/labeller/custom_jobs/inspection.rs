@@ -20,7 +20,7 @@ const LOST_MARGIN: Duration = Duration::from_secs(600);
 /// What a look at the directory of a job shows.
 #[derive(Debug, PartialEq)]
 pub enum CustomDirectory {
-    /// There is none.
+    /// There is none, or so little of it that no job can begin.
     Missing,
     /// The job is another user's, or one of another batch system.
     Foreign,

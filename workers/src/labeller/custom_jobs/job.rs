@@ -9,6 +9,10 @@ use ::batch::JobId;
 use dft::result_file;
 use serde::{Deserialize, Serialize};
 
+/// What each submission runs.
+pub(super) const SCRIPT: &str = "run.sh";
+/// The request to its runner.
+pub(super) const REQUEST: &str = "order.json";
 /// A link that the job that calculates creates; it leads to the number of its submission.
 pub(super) const BEGUN: &str = "begun";
 /// Where the link leads when no job may calculate any more.
@@ -59,6 +63,11 @@ impl CustomJob {
         let number = fs::read_link(&link).ok()?.to_str()?.parse().ok()?;
         let time = fs::symlink_metadata(&link).and_then(|link| link.modified()).ok()?;
         Some((number, time.elapsed().unwrap_or_default()))
+    }
+
+    /// Whether its directory has what a job needs to begin. Somebody may have removed a part of it.
+    pub(super) fn can_begin(&self) -> bool {
+        [SCRIPT, REQUEST].iter().all(|file| self.directory.join(file).is_file())
     }
 
     /// The submissions so far that were not refused.

@@ -216,15 +216,14 @@ fn look_at_directory(job: &CustomJob) -> CustomDirectory {
     if let Some(end) = CalculationEnd::read(&job.directory) {
         return CustomDirectory::Ended(end);
     }
-    match exists {
-        _ if job.user != own_user() => CustomDirectory::Foreign,
-        true => CustomDirectory::Open {
-            begun: job.begun(),
-            submissions: job.submissions(),
-            may_be_submitted: job.may_be_submitted(),
-        },
-        false => CustomDirectory::Missing,
+    if job.user != own_user() {
+        return CustomDirectory::Foreign;
     }
+    let begun = job.begun();
+    if !exists || begun.is_none() && !job.can_begin() {
+        return CustomDirectory::Missing;
+    }
+    CustomDirectory::Open { begun, submissions: job.submissions(), may_be_submitted: job.may_be_submitted() }
 }
 
 fn no_submission_left(job: &CustomJob) -> StoreError {
@@ -257,17 +256,16 @@ mod tests {
         )
         .unwrap();
         let jobs = CustomJobs::new(scheduler, &PassedEnvironment::default());
-        let calculation = Calculation {
-            directory: home.path().to_owned(),
-            command: vec!["abinit".to_owned()],
-            environment: Vec::new(),
-            pass_environment: Default::default(),
-            time_limit: 3600.0,
-            memory_limit: None,
-            runner: RunnerCommand { program: "/bin/touch".into(), arguments: vec!["ran".to_owned()] },
-        };
-        let job = jobs.prepare(calculation, 1, 0).unwrap();
+        let runner = RunnerCommand { program: "/bin/touch".into(), arguments: vec!["ran".to_owned()] };
+        let job = jobs.prepare(Calculation::example(home.path(), runner), 1, 0).unwrap();
         assert_eq!(jobs.inspect(&job).await.unwrap(), CalculationState::Ready);
+        // Somebody has removed a part of the directory.
+        for file in [job::SCRIPT, job::REQUEST].map(|file| home.path().join(file)) {
+            let content = fs::read(&file).unwrap();
+            fs::remove_file(&file).unwrap();
+            assert_eq!(jobs.inspect(&job).await.unwrap(), CalculationState::Gone);
+            fs::write(file, content).unwrap();
+        }
         while job.begin_submission().unwrap().is_some() {}
         assert_eq!(jobs.inspect(&job).await.unwrap(), CalculationState::Gone);
         assert!(job.is_closed());

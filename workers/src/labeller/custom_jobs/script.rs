@@ -9,12 +9,8 @@ use ::batch::{CustomClient, JobRequest, quoted};
 
 use super::super::calculation_runner::{self, Calculation, NODE_VARIABLE, RunnerRequest};
 use super::super::slurm::runner;
-use super::job::{self, BEGUN, MAX_NUMBER};
+use super::job::{self, BEGUN, MAX_NUMBER, REQUEST, SCRIPT};
 
-/// What each submission runs.
-const SCRIPT: &str = "run.sh";
-/// The request to its runner.
-const REQUEST: &str = "order.json";
 /// The time limit of the job exceeds that of the runner, which ends the calculation in order, by this, s.
 const MARGIN: f64 = 60.0;
 
@@ -103,18 +99,11 @@ mod tests {
             "##,
         )
         .unwrap();
-        let calculation = Calculation {
-            directory: home.path().to_owned(),
-            command: vec!["abinit".to_owned()],
-            environment: Vec::new(),
-            pass_environment: Default::default(),
-            time_limit: 3600.0,
-            memory_limit: Some(2_000_000_000),
-            runner: RunnerCommand {
-                program: "/opt/it's/calmwalk".into(),
-                arguments: vec!["calculation-runner".to_owned()],
-            },
+        let runner = RunnerCommand {
+            program: "/opt/it's/calmwalk".into(),
+            arguments: vec!["calculation-runner".to_owned()],
         };
+        let calculation = Calculation::example(home.path(), runner);
         write(calculation, &CustomClient::new(scheduler, Duration::ZERO), 4, 2).unwrap();
         let here = home.path().display();
         for number in 1..=MAX_NUMBER {

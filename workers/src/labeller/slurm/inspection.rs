@@ -12,7 +12,7 @@ use super::super::batch_job::SCRATCH_NOT_SHARED;
 use super::super::calculation_runner::CalculationEnd;
 use super::super::calculation_state::CalculationState;
 use super::super::private_directory;
-use super::job::BEGUN;
+use super::job::{BEGUN, REQUEST, SCRIPT};
 use super::squeue::{SqueueJob, most_informative};
 
 /// What a look at the directory of a job shows.
@@ -26,19 +26,25 @@ pub enum JobDirectory {
     Own {
         /// Whether a job has begun to calculate.
         begun: bool,
+        /// Whether it has what a job needs to begin. Somebody may have removed a part of it.
+        can_begin: bool,
         /// The recorded end.
         end: Option<CalculationEnd>,
     },
 }
 
 impl JobDirectory {
-    pub(super) fn look(directory: &Path) -> Self {
+    pub(in super::super) fn look(directory: &Path) -> Self {
         if directory.symlink_metadata().is_err() {
             return Self::Missing;
         }
-        match private_directory::is_own(directory) {
-            true => Self::Own { begun: directory.join(BEGUN).is_dir(), end: CalculationEnd::read(directory) },
-            false => Self::Foreign,
+        if !private_directory::is_own(directory) {
+            return Self::Foreign;
+        }
+        Self::Own {
+            begun: directory.join(BEGUN).is_dir(),
+            can_begin: [SCRIPT, REQUEST].iter().all(|file| directory.join(file).is_file()),
+            end: CalculationEnd::read(directory),
         }
     }
 }
@@ -71,13 +77,13 @@ pub enum InspectionStep {
 impl Inspection {
     /// Continues with what a look at the directory shows.
     pub fn looked(&mut self, found: JobDirectory) -> InspectionStep {
-        let (exists, begun) = match found {
+        let (exists, begun, can_begin) = match found {
             JobDirectory::Foreign => return InspectionStep::Is(CalculationState::Elsewhere),
             JobDirectory::Own { end: Some(end), .. } => {
                 return InspectionStep::Is(CalculationState::Ended(end));
             }
-            JobDirectory::Own { begun, end: None } => (true, begun),
-            JobDirectory::Missing => (false, false),
+            JobDirectory::Own { begun, can_begin, end: None } => (true, begun, can_begin),
+            JobDirectory::Missing => (false, false, false),
         };
         match self.answer.take() {
             None => {
@@ -86,7 +92,7 @@ impl Inspection {
             }
             // It was removed meanwhile.
             Some(_) if !exists => InspectionStep::Is(CalculationState::Gone),
-            Some(jobs) => self.finished(&jobs, begun),
+            Some(jobs) => self.finished(&jobs, begun, can_begin),
         }
     }
 
@@ -107,9 +113,10 @@ impl Inspection {
     }
 
     /// A job that is over or unknown to Slurm, and of which no end is recorded.
-    fn finished(&self, jobs: &[SqueueJob], begun: bool) -> InspectionStep {
+    fn finished(&self, jobs: &[SqueueJob], begun: bool, can_begin: bool) -> InspectionStep {
         match most_informative(jobs) {
-            None if !begun => InspectionStep::Is(CalculationState::Ready),
+            None if !begun && can_begin => InspectionStep::Is(CalculationState::Ready),
+            None if !begun => InspectionStep::Is(CalculationState::Gone),
             // Perhaps after Slurm's answer: the next inspection knows more.
             _ if begun && !self.begun => InspectionStep::Is(CalculationState::Running),
             Some(reported) if !begun && reported.ran_to_its_end() => InspectionStep::NotVisible(format!(
@@ -131,7 +138,7 @@ mod tests {
     use CalculationState::{Elsewhere, Ended, Gone, Ready, Running};
 
     fn own(begun: bool) -> JobDirectory {
-        JobDirectory::Own { begun, end: None }
+        JobDirectory::Own { begun, can_begin: true, end: None }
     }
 
     fn end() -> CalculationEnd {
@@ -158,10 +165,10 @@ mod tests {
     #[test]
     fn a_recorded_end_needs_no_answer_of_slurm() {
         let mut inspection = Inspection::default();
-        let ended = JobDirectory::Own { begun: true, end: Some(end()) };
+        let ended = JobDirectory::Own { begun: true, can_begin: true, end: Some(end()) };
         assert_eq!(inspection.looked(ended), InspectionStep::Is(Ended(end())));
         assert_eq!(Inspection::default().looked(JobDirectory::Foreign), InspectionStep::Is(Elsewhere));
-        let late = JobDirectory::Own { begun: true, end: Some(end()) };
+        let late = JobDirectory::Own { begun: true, can_begin: true, end: Some(end()) };
         assert_eq!(inspect(own(true), reported("COMPLETED"), late), InspectionStep::Is(Ended(end())));
     }
 
@@ -190,6 +197,21 @@ mod tests {
             InspectionStep::Is(Gone)
         );
         assert_eq!(inspect(own(true), Vec::new(), JobDirectory::Missing), InspectionStep::Is(Gone));
+    }
+
+    #[test]
+    fn a_directory_from_which_a_part_was_removed_is_not_ready() {
+        let home = tempfile::tempdir().unwrap();
+        let look = || JobDirectory::look(home.path());
+        for file in [SCRIPT, REQUEST] {
+            assert_eq!(look(), JobDirectory::Own { begun: false, can_begin: false, end: None });
+            assert_eq!(inspect(look(), Vec::new(), look()), InspectionStep::Is(Gone));
+            std::fs::write(home.path().join(file), "").unwrap();
+        }
+        assert_eq!(inspect(look(), Vec::new(), look()), InspectionStep::Is(Ready));
+        let begun = JobDirectory::Own { begun: true, can_begin: false, end: None };
+        let later = JobDirectory::Own { begun: true, can_begin: false, end: None };
+        assert_eq!(inspect(begun, Vec::new(), later), InspectionStep::InferEnd(None));
     }
 
     /// The `sbatch` of a labeller that was killed may arrive after Slurm's answer.

@@ -119,28 +119,17 @@ pub(super) fn arguments(job: &CalculationJob) -> Vec<OsString> {
 mod tests {
     use super::*;
 
-    fn calculation(directory: &Path) -> Calculation {
-        Calculation {
-            directory: directory.to_owned(),
-            command: vec!["abinit".to_owned()],
-            environment: Vec::new(),
-            pass_environment: Default::default(),
-            time_limit: 3600.0,
-            memory_limit: Some(2_000_000_000),
-            runner: RunnerCommand {
-                program: "/opt/it's/calmwalk".into(),
-                arguments: vec!["calculation-runner".to_owned()],
-            },
-        }
-    }
-
     #[test]
     fn a_script_contains_everything_a_job_needs() {
         let home = tempfile::tempdir().unwrap();
         let options = ["--partition=long".to_owned()];
         let avoid = ["n1".to_owned(), "n2".to_owned()];
+        let runner = RunnerCommand {
+            program: "/opt/it's/calmwalk".into(),
+            arguments: vec!["calculation-runner".to_owned()],
+        };
         write(
-            calculation(home.path()),
+            Calculation::example(home.path(), runner),
             &JobRequirements { cores: 4, gpus: 2, options: &options, avoid: &avoid },
         )
         .unwrap();
