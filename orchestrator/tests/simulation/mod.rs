@@ -57,6 +57,8 @@ const SEEDS_WITH_REFITS: u64 = 8;
 const SEEDS_WITH_SLURM: u64 = 12;
 /// The same with jobs of PBS or LSF.
 const SEEDS_WITH_CUSTOM: u64 = 8;
+/// Seeds that once broke an invariant, and those that find errors which the program once had; docs/simulation.md names them.
+const ONCE_BROKEN: [u64; 5] = [8_844, REFIT_SEEDS + 35, SLURM_SEEDS + 8, SLURM_SEEDS + 18, CUSTOM_SEEDS + 9];
 /// A planted bug must be found within this number of seeds.
 const SEEDS_TO_FIND: u64 = 1_000;
 
@@ -189,10 +191,17 @@ fn no_seed_with_another_batch_system_breaks_an_invariant() {
     check_seeds(seeds(CUSTOM_SEEDS, SEEDS_WITH_CUSTOM));
 }
 
-fn check_seeds(seeds: Range<u64>) {
-    let (mut events, mut time, number) = (0, 0, seeds.end - seeds.start);
+/// Whatever was mended stays so.
+#[test]
+fn no_seed_breaks_an_invariant_again() {
+    check_seeds(ONCE_BROKEN);
+}
+
+fn check_seeds(seeds: impl IntoIterator<Item = u64>) {
+    let (mut events, mut time, mut number) = (0, 0, 0);
     for seed in seeds {
         let outcome = check(seed);
+        number += 1;
         events += outcome.events;
         time += outcome.ended;
     }

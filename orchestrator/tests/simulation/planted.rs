@@ -86,10 +86,12 @@ pub enum PlantedBug {
     RefusalForgotten,
     /// A labeller removes every directory that another one left, whether its result is needed or not.
     WantedRemoved,
+    /// A labeller removes a directory under its own name.
+    RemovedInPart,
 }
 
 impl PlantedBug {
-    pub const ALL: [Self; 40] = [
+    pub const ALL: [Self; 41] = [
         Self::AnswerBeforeCommit,
         Self::FailedCommitBelieved,
         Self::CommitRepeated,
@@ -130,6 +132,7 @@ impl PlantedBug {
         Self::LadderRestarted,
         Self::RefusalForgotten,
         Self::WantedRemoved,
+        Self::RemovedInPart,
     ];
 }
 
@@ -155,7 +158,8 @@ impl PlantedBug {
             | Self::OldAnswerBelieved
             | Self::EndsMixedUp
             | Self::NodeFailuresCounted
-            | Self::LadderRestarted => SLURM_SEEDS,
+            | Self::LadderRestarted
+            | Self::RemovedInPart => SLURM_SEEDS,
             Self::RefusalForgotten | Self::WantedRemoved => CUSTOM_SEEDS,
             _ => 0,
         }
@@ -184,8 +188,8 @@ impl PlantedBug {
             Self::CalculationRecordedLate => 57,
             Self::AgentLossForgotten => AGENT_SEEDS,
             Self::LateReplyBelieved | Self::OldSlotsKept => AGENT_SEEDS + 1,
-            Self::RefusalForgotten => CUSTOM_SEEDS + 195,
-            Self::WantedRemoved => CUSTOM_SEEDS + 90,
+            Self::RefusalForgotten => CUSTOM_SEEDS + 9,
+            Self::WantedRemoved => CUSTOM_SEEDS + 4,
             Self::AssignmentDealtTwice => AGENT_SEEDS,
             Self::NewestMixture => AGENT_SEEDS + 15,
             Self::SessionOfAllVersions => REFIT_SEEDS + 35,
@@ -193,9 +197,10 @@ impl PlantedBug {
             Self::VersionLimitForgotten | Self::VersionRecordedTwice | Self::OldWalksContinue => {
                 REFIT_SEEDS + 1
             }
-            Self::NodeFailuresCounted | Self::LadderRestarted => SLURM_SEEDS,
-            Self::BegunOverlooked | Self::EndsMixedUp => SLURM_SEEDS + 1,
-            Self::FilesBelievedAtOnce => SLURM_SEEDS + 6,
+            Self::NodeFailuresCounted | Self::LadderRestarted | Self::EndsMixedUp => SLURM_SEEDS,
+            Self::BegunOverlooked => SLURM_SEEDS + 2,
+            Self::FilesBelievedAtOnce => SLURM_SEEDS + 12,
+            Self::RemovedInPart => SLURM_SEEDS + 18,
             Self::SilenceTakenAsGone => SLURM_SEEDS + 7,
             Self::OldAnswerBelieved => SLURM_SEEDS + 8,
         }

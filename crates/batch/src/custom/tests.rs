@@ -6,23 +6,12 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use proptest::prelude::*;
-use serde::Deserialize;
 use tempfile::TempDir;
 
 use super::*;
 use crate::job_id::JobId;
 
 const EXAMPLES: [&str; 2] = ["pbs", "lsf"];
-
-#[derive(Deserialize)]
-struct Example {
-    launch: Launch,
-}
-
-#[derive(Deserialize)]
-struct Launch {
-    custom: CustomScheduler,
-}
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
@@ -31,7 +20,7 @@ fn root() -> PathBuf {
 /// The batch system of `configs/NAME.toml`.
 fn example(name: &str) -> CustomScheduler {
     let text = fs::read_to_string(root().join(format!("configs/{name}.toml"))).unwrap();
-    toml::from_str::<Example>(&text).unwrap().launch.custom
+    text.parse::<toml::Table>().unwrap()["launch"]["custom"].clone().try_into().unwrap()
 }
 
 /// A batch system on this host.

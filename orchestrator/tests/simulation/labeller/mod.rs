@@ -143,10 +143,7 @@ impl World {
                 self.labeller_delivers(id, lease, result, calculation);
             }
             Phase::Stops => {}
-            Phase::Removes { calculation } => {
-                self.remove_directory(&calculation);
-                self.labeller_continues(id, Phase::Idle, 0);
-            }
+            Phase::Removes { calculation } => self.remove_directory(id, &calculation),
             Phase::Releases => self.labeller_releases(id),
             Phase::Leaves => self.labeller_leaves(id),
         }

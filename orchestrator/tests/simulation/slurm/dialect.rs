@@ -5,23 +5,12 @@ use std::rc::Rc;
 
 use batch::{CommandOutput, CustomScheduler, JobId};
 use dft::FailureClass;
-use serde::Deserialize;
 
 /// A batch system other than Slurm.
 #[derive(Clone)]
 pub struct Dialect {
     pub scheduler: Rc<CustomScheduler>,
     is_lsf: bool,
-}
-
-#[derive(Deserialize)]
-struct Example {
-    launch: Launch,
-}
-
-#[derive(Deserialize)]
-struct Launch {
-    custom: CustomScheduler,
 }
 
 fn well(stdout: String) -> CommandOutput {
@@ -39,8 +28,9 @@ impl Dialect {
         let name = if is_lsf { "lsf" } else { "pbs" };
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("../configs/{name}.toml"));
         let text = std::fs::read_to_string(path).expect("an example");
-        let Example { launch: Launch { custom } } = toml::from_str(&text).expect("a table launch.custom");
-        Self { scheduler: Rc::new(custom), is_lsf }
+        let table: toml::Table = text.parse().expect("TOML");
+        let scheduler: CustomScheduler = table["launch"]["custom"].clone().try_into().expect("its table");
+        Self { scheduler: Rc::new(scheduler), is_lsf }
     }
 
     /// The id of a job.

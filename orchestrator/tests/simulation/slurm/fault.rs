@@ -57,6 +57,8 @@ pub enum SlurmFault {
     FilesLate { until: Time },
     /// The directory of a calculation is removed.
     DirectoryRemoved,
+    /// The next labeller that removes a directory is killed meanwhile.
+    KilledInRemoval,
 }
 
 impl SlurmFault {
@@ -99,6 +101,9 @@ impl fmt::Display for SlurmFault {
                 write!(f, "files of nodes are seen late until {} s", seconds(until))
             }
             Self::DirectoryRemoved => f.write_str("the directory of a calculation is removed"),
+            Self::KilledInRemoval => {
+                f.write_str("the next labeller that removes a directory will be killed meanwhile")
+            }
         }
     }
 }

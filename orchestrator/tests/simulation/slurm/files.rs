@@ -25,6 +25,8 @@ pub struct CalculationFiles {
     /// Nodes that its script excludes.
     pub excluded: BTreeSet<String>,
     pub is_removed: bool,
+    /// A labeller has begun to remove it under its own name: begin and end are no longer there, what a job needs is.
+    pub is_torn: bool,
     /// When a job has begun, and when labellers see it.
     pub begun: Option<(Time, Time)>,
     /// The number of the submission that calculates, of another batch system than Slurm.
@@ -93,8 +95,9 @@ impl SharedFiles {
         match self.directories.get(name).filter(|found| !found.is_removed) {
             None => JobDirectory::Missing,
             Some(found) => JobDirectory::Own {
-                begun: found.begun.is_some_and(|(_, seen)| seen <= self.now),
-                end: found.end.as_ref().filter(|(.., seen)| *seen <= self.now).map(|(end, ..)| end.clone()),
+                begun: !found.is_torn && found.begun.is_some_and(|(_, seen)| seen <= self.now),
+                can_begin: true,
+                end: self.seen_end(name),
             },
         }
     }
@@ -109,16 +112,16 @@ impl SharedFiles {
             return CustomDirectory::Ended(end);
         }
         let age = |time: Time| Duration::from_millis(self.now.saturating_sub(time));
-        let begun = found.begun.filter(|(_, seen)| *seen <= self.now);
-        let submissions = found.submissions.iter().map(|(number, (id, time))| JobSubmission {
-            number: *number,
-            id: id.clone(),
-            age: age(*time),
-        });
+        let begun = found.begun.filter(|(_, seen)| *seen <= self.now && !found.is_torn);
+        let submissions = found
+            .submissions
+            .iter()
+            .filter(|_| !found.is_torn)
+            .map(|(number, (id, time))| JobSubmission { number: *number, id: id.clone(), age: age(*time) });
         CustomDirectory::Open {
             begun: begun.map(|(time, _)| (found.begun_by, age(time))),
             submissions: submissions.collect(),
-            may_be_submitted: found.free_number(bug).is_some(),
+            may_be_submitted: found.is_torn || found.free_number(bug).is_some(),
         }
     }
 
@@ -137,7 +140,7 @@ impl SharedFiles {
 
     /// The recorded end, if labellers see it.
     pub fn seen_end(&self, name: &str) -> Option<CalculationEnd> {
-        let found = self.directories.get(name).filter(|found| !found.is_removed)?;
+        let found = self.directories.get(name).filter(|found| !found.is_removed && !found.is_torn)?;
         found.end.as_ref().filter(|(.., seen)| *seen <= self.now).map(|(end, ..)| end.clone())
     }
 
@@ -197,6 +200,9 @@ impl SharedFiles {
 
     /// A labeller submits a job that it considers not begun.
     pub fn check_not_begun(&mut self, name: &str) {
+        if self.directories.get(name).is_some_and(|found| found.is_torn && !found.is_removed) {
+            self.fail(format!("calculation {name}, a part of whose directory was removed, is submitted"));
+        }
         if matches!(self.look(name), JobDirectory::Own { begun: true, .. }) {
             self.fail(format!("calculation {name} has begun and is submitted again"));
         }
@@ -218,10 +224,13 @@ impl SharedFiles {
         found.is_some_and(|found| !std::mem::take(&mut found.excluded).is_empty())
     }
 
-    /// Removes a directory. Its calculation must not run, and its result must be delivered or lost.
-    pub fn remove(&mut self, name: &str, why: DirectoryRemoval) {
-        let Some(found) = self.directories.get_mut(name) else { return };
-        if std::mem::replace(&mut found.is_removed, true) || found.is_damaged {
+    /// Begins to remove a directory, which gets another name first, so that nothing is left under its own. Its calculation must not
+    /// run, and its result must be delivered or lost.
+    pub fn begin_removal(&mut self, name: &str, why: DirectoryRemoval, bug: Option<PlantedBug>) {
+        let Some(found) = self.directories.get_mut(name).filter(|found| !found.is_removed) else { return };
+        let keeps_name = bug == Some(PlantedBug::RemovedInPart);
+        found.is_removed = !keeps_name;
+        if std::mem::replace(&mut found.is_torn, keeps_name) || found.is_damaged {
             return;
         }
         let has_result = found.truth.is_some_and(|truth| truth != Err(FailureClass::NodeFailure));
@@ -241,6 +250,13 @@ impl SharedFiles {
         if is_needed {
             let running = if found.is_running { "runs" } else { "is not delivered" };
             self.fail(format!("the directory of calculation {name}, which {running}, is removed: {why:?}"));
+        }
+    }
+
+    /// Nothing is left of a directory.
+    pub fn end_removal(&mut self, name: &str) {
+        if let Some(found) = self.directories.get_mut(name) {
+            found.is_removed = true;
         }
     }
 

@@ -55,6 +55,8 @@ pub enum Request {
     Delete(JobId),
     /// What the store knows of the attempt that made a calculation.
     Past(i64, u32),
+    /// The content of a directory is removed.
+    Remove,
 }
 
 /// The answer.
@@ -156,8 +158,15 @@ impl LabellerIo {
             Some(dialect) => self.cancel_custom(dialect, name).await?,
             None => self.cancel_slurm(name).await?,
         }
-        self.files.borrow_mut().remove(name, why);
+        self.remove(name, why).await;
         Ok(())
+    }
+
+    /// Removes a directory. That takes a while, in which the labeller may be killed.
+    async fn remove(&self, name: &str, why: DirectoryRemoval) {
+        self.files.borrow_mut().begin_removal(name, why, self.bug);
+        self.request(Request::Remove).await;
+        self.files.borrow_mut().end_removal(name);
     }
 
     /// The newest of these calculations that can be waited for, and whether it must be submitted.
@@ -210,7 +219,7 @@ impl LabellerIo {
         let result = match result {
             Ok(energy) => CalculationResult::Label(energy),
             Err(FailureClass::OtherProgram) => {
-                self.files.borrow_mut().remove(&name, DirectoryRemoval::OtherProgram);
+                self.remove(&name, DirectoryRemoval::OtherProgram).await;
                 return Err("another program has calculated".to_owned());
             }
             Err(class) => {
@@ -268,7 +277,7 @@ impl LabellerIo {
                 _ => past,
             };
             if is_left_over(&past, state.as_ref()) {
-                self.files.borrow_mut().remove(&name, DirectoryRemoval::LeftOver);
+                self.remove(&name, DirectoryRemoval::LeftOver).await;
             }
         }
         Ok(())

@@ -119,6 +119,8 @@ impl World {
                     }
                 }
             }
+            Request::Remove if self.is_killed_in_removal(id) => return,
+            Request::Remove => (Answer::Done, delay),
             Request::Take(calculation) => {
                 self.labeller_takes(id, calculation);
                 (Answer::Done, 0)
@@ -140,13 +142,26 @@ impl World {
         matches!(request, Request::List) && self.slurm.list.as_ref().is_some_and(|(made, _)| recent(*made))
     }
 
-    /// Removes the directory of a calculation whose result is delivered.
-    pub fn remove_directory(&mut self, calculation: &str) {
+    /// A labeller removes the directory of a calculation whose result is delivered.
+    pub fn remove_directory(&mut self, labeller: u32, calculation: &str) {
         let mut files = self.slurm.files.borrow_mut();
-        files.remove(calculation, DirectoryRemoval::Delivered);
+        files.begin_removal(calculation, DirectoryRemoval::Delivered, self.bug);
         let broken = files.broken.take();
         drop(files);
         broken.into_iter().for_each(|broken| self.fail(broken));
+        if !self.is_killed_in_removal(labeller) {
+            self.slurm.files.borrow_mut().end_removal(calculation);
+            self.labeller_is_idle(labeller);
+        }
+    }
+
+    /// Kills a labeller that removes a directory, if a fault asks for it.
+    fn is_killed_in_removal(&mut self, labeller: u32) -> bool {
+        let is_killed = std::mem::take(&mut self.slurm.kills_in_removal);
+        if is_killed {
+            self.labeller_exits(labeller, Exit::Killed);
+        }
+        is_killed
     }
 
     /// The list that labellers share, made again if it is old.

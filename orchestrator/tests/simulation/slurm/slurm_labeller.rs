@@ -19,8 +19,8 @@ const CANCEL_TIMEOUT: Time = 5_000;
 impl LabellerIo {
     fn look(&self, name: &str) -> JobDirectory {
         match self.files.borrow().look(name) {
-            JobDirectory::Own { end, .. } if self.bug == Some(PlantedBug::BegunOverlooked) => {
-                JobDirectory::Own { begun: false, end }
+            JobDirectory::Own { can_begin, end, .. } if self.bug == Some(PlantedBug::BegunOverlooked) => {
+                JobDirectory::Own { begun: false, can_begin, end }
             }
             found => found,
         }
@@ -47,7 +47,7 @@ impl LabellerIo {
         let mut inspection = Inspection::default();
         let first = match self.look(name) {
             JobDirectory::Own { end: None, .. } if self.bug == Some(PlantedBug::OldAnswerBelieved) => {
-                JobDirectory::Own { begun: true, end: None }
+                JobDirectory::Own { begun: true, can_begin: true, end: None }
             }
             found => found,
         };
