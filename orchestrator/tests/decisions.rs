@@ -7,7 +7,8 @@ use calm::UpdateRule;
 use calm::grade::maximum;
 use calm::rules::MaximumGradeUpdate;
 use orchestrator::selector::{
-    CampaignMode, Selector, SelectorSettings, SelectorSnapshot, TrainingFrames, UpdateProtocol,
+    CampaignMode, Selector, SelectorError, SelectorSettings, SelectorSnapshot, TrainingFrames,
+    UpdateProtocol, VERSION,
 };
 use store::records::{Commit, Fate};
 use wire::CompletionCoefficients;
@@ -16,7 +17,7 @@ use wire::messages::{DeclineReason, Verdict, WalkEnd};
 use crate::common;
 use crate::common::{
     SHORTEST, begin, completes_up_to, decided, ended, features, gamma_max, kinds, mixture, next_assignment,
-    offer, positive, settings, structure, try_restore, value,
+    offer, positive, restore, settings, structure, try_restore, value,
 };
 
 /// γ = 3 in the first component.
@@ -109,6 +110,30 @@ fn a_candidate_that_cannot_be_graded_is_left_out() {
     assert_eq!(assignment.verdict, Some(Verdict::Declined(DeclineReason::LeftOut)));
     let report = offer(&selector, &assignment, 6, structure(2, SHORTEST), NEW);
     assert_eq!(kinds(&decided(&mut selector, report)), ["accepted"]);
+}
+
+/// It is an error of the campaign, whatever the candidate.
+#[test]
+fn an_error_that_is_not_of_the_candidate_is_returned() {
+    let mut selector = begin(&live(), 1);
+    let assignment = next_assignment(&mut selector);
+    let report = offer(&selector, &assignment, 5, structure(1, SHORTEST), NEW);
+    let failed = report.map_candidate(|_| Err(SelectorError::Snapshot("damaged".to_owned())));
+    let error = selector.report_regraded(failed).unwrap_err();
+    assert!(matches!(error, SelectorError::Snapshot(_)), "{error}");
+}
+
+/// Databases of campaigns with neither are as in earlier versions of the program.
+#[test]
+fn what_never_happened_is_not_stored() {
+    let mut selector = restore(&live(), 1, SelectorSnapshot::default());
+    let begun = selector.start_walks();
+    let offered = next_candidate(&mut selector, 5, 1, NEW);
+    for commit in [begun, offered] {
+        let names: Vec<_> = commit.values.iter().map(|(name, _)| name.as_str()).collect();
+        assert!(names.contains(&"round"), "{names:?}");
+        assert!(![VERSION, "left_out"].iter().any(|name| names.contains(name)), "{names:?}");
+    }
 }
 
 /// The covariance shrinks in the direction of the training atom, whose σ² is then no longer finite.
@@ -502,6 +527,12 @@ fn candidates_beyond_the_largest_grade_under_the_original_mixture_are_declined()
     let grade = |mixture: &str| detail[mixture]["gamma_max"].as_f64().unwrap();
     assert!(grade("selector") < 4.0 && grade("original") > 4.0, "{detail}");
     assert_eq!((commit.components.len(), commit.walks[0].accepted), (0, 1));
+    // The bound itself is allowed.
+    let bound = maximum(&commit.candidates[0].original.gamma);
+    for (max_grade, kind) in [(bound, "accepted"), (bound.next_down(), "declined grade_too_large")] {
+        let mut selector = begin(&SelectorSettings { max_grade: Some(max_grade), ..live() }, 1);
+        assert_eq!(kinds(&next_candidate(&mut selector, 5, 1, [0.0, 4.5, 0.0])), [kind]);
+    }
 }
 
 /// The rule of updates is used in the search, not only the collection rule.

@@ -482,6 +482,21 @@ fn a_control_frame_with_atoms_too_close_is_left_out() {
     assert!(matches!(selector.next_assignment(0), Scheduling::Done));
 }
 
+/// Its dynamics may have gone on beyond a frame before it was asked for.
+#[test]
+fn a_control_walk_that_missed_its_last_frame_ends() {
+    let mut store = MemoryStore::default();
+    let mut selector = with_control(&mut store, &[5, 12]);
+    for (step, expected) in [(10, vec![]), (12, vec!["ended"])] {
+        let assignment = next_assignment(&mut selector);
+        assert_eq!((assignment.origin, assignment.last_step), (Origin::Control, step));
+        let commit = decided(&mut selector, common::report(&assignment, Outcome::StepsDone, at(step)));
+        assert_eq!(kinds(&commit), expected);
+        assert!(commit.decisions.iter().all(|decision| decision.detail["end"] == "completed"));
+    }
+    assert!(selector.is_done());
+}
+
 #[test]
 fn a_walk_that_collected_nothing_has_no_control() {
     let mut selector = with_control(&mut MemoryStore::default(), &[]);

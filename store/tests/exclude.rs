@@ -214,3 +214,27 @@ async fn imported_structures_have_labels_to_exclude() {
     assert_eq!(exported(&store, &dft).await, [-1.0, -5.0, -6.0]);
     whole(&store).await;
 }
+
+/// What was excluded by hand is not calculated again without a request.
+#[tokio::test]
+async fn a_job_of_a_structure_with_an_excluded_label_is_done() {
+    let database = TestDatabase::new();
+    let store = database.create().await.with_caller_clock();
+    let (names, dft) = (accept(&store, 1).await, protocol("dft"));
+    let state = async |name: &str| store.queue_show(name).await.unwrap().job.state;
+    // Its job was dropped before the result came.
+    let first = lease(&store, 0).await;
+    store.drop_job(&names[0], 1).await.unwrap();
+    assert_eq!(store.complete(&first, &label(-1.0), 2).await.unwrap(), CompleteOutcome::Label);
+    store.exclude(&names, "bad", 3).await.unwrap();
+    assert_eq!(state(&names[0]).await, JobState::Dropped);
+    store.retry_job(&names[0], 4).await.unwrap();
+    assert_eq!(state(&names[0]).await, JobState::Labelled);
+    // The label was imported before a walk came to the structure.
+    store.import(dft.hash, "x", &[(0, structure(2e-6), label(-2.0))], 5).await.unwrap();
+    store.exclude(&["import-1".to_owned()], "bad", 6).await.unwrap();
+    let found = candidate(0, 2, Origin::Biased, Fate::Accepted);
+    store.commit(&commit_of(vec![found.clone()])).await.unwrap();
+    assert_eq!(state(&name_of(&found)).await, JobState::Labelled);
+    assert!(store.lease(dft.hash, "host/a", 7, 10).await.unwrap().is_none());
+}

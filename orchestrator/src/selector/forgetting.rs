@@ -136,3 +136,33 @@ impl ForgettingState {
         value
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use calm::Component;
+
+    use super::*;
+
+    #[test]
+    fn the_alarm_is_raised_above_one() {
+        let state = |level| ForgettingState {
+            training: None,
+            elements: Vec::new(),
+            level,
+            level_of_share: level,
+            level_of_growth: 0.0,
+        };
+        assert_eq!([0.9, 1.0, 1.1].map(|level| state(level).is_alarming()), [false, false, true]);
+    }
+
+    /// Mixtures of other programs may have no counts of atoms.
+    #[test]
+    fn an_element_without_counts_has_not_grown() {
+        let component = Component::new(vec![0.0], vec![1.0], 1.0, None).unwrap();
+        let mixture = Mixture::new(0, vec![vec![Arc::new(component)]]).unwrap();
+        let (element, share) = Forgetting::new(vec!["Al".to_owned()], None).element(&mixture, 0);
+        assert_eq!((element.element.as_str(), element.mean_square_growth, share), ("Al", 1.0, None));
+    }
+}

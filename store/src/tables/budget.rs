@@ -136,3 +136,37 @@ async fn time_under_way(transaction: &mut Transaction) -> Result<u64> {
     let time = time.map(|text| text.parse()).transpose();
     Ok(time.map_err(|error| StoreError::damaged("the time under way", error))?.unwrap_or_default())
 }
+
+#[cfg(test)]
+mod tests {
+    use wire::CampaignId;
+
+    use super::*;
+    use crate::records::CampaignRecord;
+
+    #[tokio::test]
+    async fn totals_are_recomputed_from_the_attempts() {
+        let home = tempfile::tempdir().unwrap();
+        let campaign = CampaignRecord {
+            id: CampaignId([1; 16]),
+            program_version: String::new(),
+            mode: "live".to_owned(),
+            configuration: String::new(),
+            resolved_configuration: "{}".to_owned(),
+            configuration_in_force: "{}".to_owned(),
+        };
+        let store = Store::create(home.path(), &campaign, &[], 0).await.unwrap();
+        let mut transaction = store.database.begin().await.unwrap();
+        for name in ["labels_made", "core_milliseconds"] {
+            set_campaign_value(&mut transaction, name, "7200000").await.unwrap();
+        }
+        transaction.commit().await.unwrap();
+        let used = async || {
+            let (_, used) = store.budget(0).await.unwrap();
+            (used.labels, used.core_hours)
+        };
+        assert_eq!(used().await, (7_200_000, 2.0));
+        rebuild_totals(&store.database).await.unwrap();
+        assert_eq!(used().await, (0, 0.0));
+    }
+}
