@@ -4,10 +4,11 @@ use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
 
 use atoms::{MinDistanceRule, Uniform};
-use calm::rules::MaximumGrade;
-use calm::{CollectionRule, Mixture};
+use calm::forgetting::ForgettingAlarm;
+use calm::rules::{MaximumGrade, MaximumGradeUpdate};
+use calm::{CollectionRule, Mixture, UpdateRule};
 use orchestrator::selector::{
-    AcceptedAtoms, CampaignMode, MixtureHistory, Replay, ReplayedDecision, SelectorSettings,
+    AcceptedAtoms, CampaignMode, MixtureHistory, OnForgetting, Replay, ReplayedDecision, SelectorSettings,
     SelectorSnapshot, TrainingFrames, UpdateProtocol, VERSION,
 };
 use proptest::prelude::*;
@@ -217,6 +218,126 @@ proptest! {
             } else if now.fate == Fate::Accepted {
                 prop_assert!(above);
             }
+        }
+    }
+}
+
+/// A walk that offers new structures in its first steps.
+fn offers(numbers: impl IntoIterator<Item = u64>) -> Script {
+    let structure = |number| Event::Structure { number, z: [0.0, 3.0, 0.0], close: false };
+    numbers.into_iter().map(structure).chain((0..20).map(|_| Event::Nothing)).collect()
+}
+
+/// The mixture is never updated, so that all structures are new to it.
+fn never(max_per_walk: u32) -> SelectorSettings {
+    SelectorSettings { update: UpdateProtocol::Never, max_per_walk, ..settings(CampaignMode::Reproducible) }
+}
+
+/// Kind of each decision of a replay; "–" for those that are not made.
+fn kinds_of(replayed: &[Option<ReplayedDecision>]) -> Vec<&'static str> {
+    replayed.iter().map(|now| now.as_ref().map_or("–", |now| now.decision.kind)).collect()
+}
+
+#[test]
+fn nothing_is_decided_about_a_walk_that_other_rules_have_ended() {
+    let lax = never(3);
+    let scripts = [offers(1..4)];
+    let campaign = Campaign::begin(&lax, &scripts, 1).finish(false);
+    let log = log(&campaign);
+    let strict = SelectorSettings { max_per_walk: 1, ..lax.clone() };
+    let mut replay = open(&campaign, &strict, 1, &["collect.max_per_walk"]);
+    let mut made = Vec::new();
+    for next in &log {
+        let is_reached = replay.is_reached(&next.0).unwrap();
+        let now = follow(&mut replay, std::slice::from_ref(next));
+        assert!(next.1.is_none() || is_reached == now[0].is_some(), "{next:?}");
+        made.extend(now);
+    }
+    assert_eq!(kinds_of(&made), ["begun", "accepted", "–", "–", "–"]);
+    assert_eq!(replay.cut_short(), 0);
+}
+
+#[test]
+fn walks_that_a_limit_has_ended_and_others_would_not_are_counted() {
+    let budget = SelectorSettings { max_structures: Some(1), ..never(3) };
+    let of_budget = [offers([1]), offers([])];
+    let (of_quota, completed) = ([offers([1])], [offers([])]);
+    // The second seed structure has two walks. The first walk would have gone on as well.
+    let cases = [(budget, &of_budget[..], 3), (never(1), &of_quota[..], 1), (never(1), &completed[..], 0)];
+    for (limited, scripts, cut_short) in cases {
+        let campaign = Campaign::begin(&limited, scripts, 1).finish(false);
+        let log = log(&campaign);
+        let mut replay = open(&campaign, &never(9), scripts.len(), &["collect.max_per_walk"]);
+        let ends = kinds_of(&follow(&mut replay, &log)).iter().filter(|kind| **kind == "ended").count();
+        assert_eq!((replay.cut_short(), ends), (cut_short, campaign.store.walks.len()), "{log:?}");
+    }
+}
+
+/// The log changes other rules, but not those that were set; there are no control walks.
+#[test]
+fn what_was_set_stays_and_control_walks_are_left_out() {
+    let few = SelectorSettings { control: true, ..never(1) };
+    let more = SelectorSettings { max_per_walk: 3, ..few.clone() };
+    let scripts = [offers(1..3)];
+    let mut campaign = Campaign::begin(&few, &scripts, 1).finish(false);
+    campaign.go_on(&more);
+    let campaign = campaign.finish(false);
+    let log = log(&campaign);
+    let kinds: Vec<_> = log.iter().map(|(recorded, _)| recorded.kind.as_str()).collect();
+    assert_eq!(kinds[..7], ["begun", "accepted", "ended", "begun", "control", "ended", "configuration"]);
+    assert_eq!(kinds[7..9], ["resumed", "accepted"]);
+    let replayed = follow(&mut open(&campaign, &few, 1, &["collect.max_per_walk"]), &log);
+    let made = kinds_of(&replayed);
+    assert_eq!(made[..7], ["begun", "accepted", "ended", "–", "–", "–", "configuration"]);
+    assert!(made[7..].iter().all(|kind| *kind == "–"), "{made:?}");
+}
+
+/// An alarm about the last structure of a walk, with and without a switch to additive updates.
+#[test]
+fn the_end_of_a_walk_is_found_beside_a_switch_to_additive_updates() {
+    let far = |number: u64| [0.0, 1.5 * 2_f64.powi(number as i32), 0.0];
+    let event = |number| Event::Structure { number, z: far(number), close: false };
+    let scripts = [(1..9).map(event).collect::<Script>()];
+    let rules = |on_forgetting, max_per_walk| {
+        let limit = ForgettingAlarm { mean_square_growth: positive(1.5), ..ForgettingAlarm::default() };
+        let reproducible = settings(CampaignMode::Reproducible);
+        let mut rules =
+            SelectorSettings { on_forgetting, max_per_walk, forgetting_alarm: limit, ..reproducible };
+        rules.search.stop = UpdateRule::MaximumGrade(MaximumGradeUpdate { target: positive(2.9) });
+        rules
+    };
+    let long = rules(OnForgetting::Additive, 50);
+    let whole = Campaign::begin(&long, &scripts, 1).finish(false);
+    let until_alarm = log(&whole).iter().position(|(recorded, _)| recorded.kind == "forgetting").unwrap() - 1;
+    for (then, now) in
+        [(OnForgetting::Additive, OnForgetting::Warn), (OnForgetting::Warn, OnForgetting::Additive)]
+    {
+        let [made_with, other] = [then, now].map(|rule| rules(rule, until_alarm as u32));
+        let campaign = Campaign::begin(&made_with, &scripts, 1).finish(false);
+        let log = log(&campaign);
+        let replayed = follow(&mut open(&campaign, &other, 1, &["calm.on_forgetting"]), &log);
+        let mut expected: Vec<_> = log.iter().map(|(recorded, _)| recorded.kind.as_str()).collect();
+        assert_eq!(expected.last(), Some(&"ended"));
+        assert_eq!(expected.contains(&"forgetting"), then == OnForgetting::Additive);
+        expected.iter_mut().filter(|kind| **kind == "forgetting").for_each(|kind| *kind = "–");
+        assert_eq!(kinds_of(&replayed), expected);
+    }
+}
+
+#[test]
+fn the_first_component_in_which_a_mixture_differs_is_found() {
+    let settings = settings(CampaignMode::Reproducible);
+    // Its atoms belong to different components.
+    let scripts = [vec![Event::Structure { number: 1, z: [20.0, 3.0, 0.0], close: false }]];
+    let campaign = Campaign::begin(&settings, &scripts, 1).finish(false);
+    let mut replay = open(&campaign, &settings, 1, &[]);
+    follow(&mut replay, &log(&campaign));
+    let mut components = Vec::new();
+    for differs in [Some((0, 0)), Some((0, 1)), None] {
+        assert_eq!(replay.first_different_component(1, &components).unwrap(), differs);
+        if let Some((element, slot)) = differs.map(|(element, slot)| (element as u32, slot as u32)) {
+            let bytes = campaign.store.components[&(element, slot)].clone();
+            components.push(ComponentRecord { element, slot, bytes });
         }
     }
 }

@@ -149,3 +149,43 @@ pub struct SelectorSnapshot {
     /// Values of past commits.
     pub values: Vec<(String, String)>,
 }
+
+#[cfg(test)]
+mod tests {
+    use serde_json::{Value, json};
+    use store::VersionState;
+
+    use super::*;
+
+    #[test]
+    fn modes_have_their_serialized_names() {
+        for mode in [CampaignMode::Reproducible, CampaignMode::Live] {
+            assert_eq!(json!(mode), mode.name());
+        }
+    }
+
+    #[test]
+    fn a_version_is_that_of_its_record() {
+        let record = VersionRecord {
+            number: 3,
+            parent: 1,
+            state: VersionState::Registered,
+            reason: String::new(),
+            method: "native".to_owned(),
+            structures: 0,
+            last_decision: 0,
+            labels: 0,
+            model_hash: "a".to_owned(),
+            mixture_hash: "b".to_owned(),
+            figures: Value::Null,
+            seconds: 0.0,
+            core_hours: 0.0,
+            time: 0,
+        };
+        let (model, mixture) = ("a".to_owned(), "b".to_owned());
+        assert_eq!(
+            PotentialVersion::from(&record),
+            PotentialVersion { version: 3, parent: 1, model, mixture }
+        );
+    }
+}
