@@ -4,6 +4,7 @@
 //! set, see `.ci/postgres`. Results are in `docs/benchmarks.md`.
 
 mod campaign;
+mod commits;
 mod database;
 mod random;
 mod recording;
@@ -11,6 +12,7 @@ mod stages;
 
 use std::time::Duration;
 
+use commits::Commits;
 use database::Database;
 use orchestrator::selector::SelectorSettings;
 use recording::{Model, Plan};
@@ -109,4 +111,29 @@ async fn measure_with(
             (1e6 * time.as_secs_f64() / n as f64, 100.0 * time.as_secs_f64() / sum.as_secs_f64());
         println!("  {name:<32} {each:>13.0} {of_sum:>9.0} %");
     }
+    if database == Database::Sqlite {
+        for size in [1, 2, group] {
+            measure_commits(model, recording, settings, size).await;
+        }
+    }
+}
+
+/// Measures single commits of groups of this size.
+async fn measure_commits(
+    model: &Model,
+    recording: &[Vec<CandidateBlock>],
+    settings: &SelectorSettings,
+    size: usize,
+) {
+    let room = Database::Sqlite.room().await;
+    let commits = Stages::default().decide(model, settings, recording);
+    let log = room.directory.path().join(format!("{}-wal", store::DATABASE));
+    let mut measured = Commits::measure(commits, recording.len(), size, room.location, &log).await;
+    let times = [0.5, 0.9, 0.99, 1.0].map(|share| format!("{:.1}", measured.quantile(share)));
+    println!(
+        "  {} commits of {size}: median, 90 %, 99 % and longest {} ms; {:.1} pages of the log each",
+        measured.times.len(),
+        times.join(", "),
+        measured.pages()
+    );
 }

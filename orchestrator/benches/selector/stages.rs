@@ -50,7 +50,8 @@ impl Stages {
         stages
     }
 
-    fn decide(
+    /// Passes all candidates through the selector; the commits.
+    pub fn decide(
         &mut self,
         model: &Model,
         settings: &SelectorSettings,

@@ -22,10 +22,20 @@ const MONITOR: f64 = 4154e-6;
 /// A commit of any size. SQLite alone, features not kept and all accepted: groups of 23 rows of 47 kB take 6.5 ms, groups
 /// of 20 rows of 171 kB 14.4 ms; the line through both has 3.4 ms per MB and this at no bytes.
 const FLUSH: f64 = 2.8e-3;
-/// Selector, stages, features not kept: a commit of 23 candidates takes 541 µs for each, this without the flush.
-const COMMIT: f64 = 541e-6 - FLUSH / 23.0;
+/// `store/src/sqlite/file.rs`: pages of the write-ahead log at which it is copied into the database, while a commit waits.
+const LOG: f64 = 4096.0;
+/// The same: 64 MB take about 0.1 s, here for each page. It is the disk's time and needs hardly a core. Pages of walks and indices that
+/// commits rewrite are copied once and do not count here.
+const COPY: f64 = 0.1 / LOG;
+/// Selector, single commits: pages that a commit of any size writes into the log, …
+const PAGES: f64 = 11.6;
+/// … and those of each candidate, without and with features.
+const CANDIDATE_PAGES: f64 = 3.5;
+const KEPT_PAGES: f64 = 9.7;
+/// Selector, stages, features not kept: a commit of 23 candidates takes 541 µs for each, this without the flush and the copies.
+const COMMIT: f64 = 541e-6 - FLUSH / 23.0 - COPY * CANDIDATE_PAGES;
 /// The same for mostly covered candidates with their features: groups of 29, 969 µs for each.
-const KEPT: f64 = 969e-6 - FLUSH / 29.0;
+const KEPT: f64 = 969e-6 - FLUSH / 29.0 - COPY * KEPT_PAGES;
 /// Bytes of an offer over the network, `docs/scaling.md`.
 const BYTES: f64 = 150e3;
 /// 10 Gbit/s.
@@ -54,8 +64,9 @@ struct Plan {
     writers: usize,
     /// Largest group of a commit.
     group: usize,
-    /// Time of a commit for each candidate, s.
+    /// Time of a commit for each candidate, s, and the pages that it writes.
     commit: f64,
+    pages: f64,
     /// Core time of an offer for agents and connections, s.
     agent: f64,
     seconds: f64,
@@ -68,6 +79,7 @@ enum Event {
     Regraded(usize),
     Decided(usize),
     Written(usize),
+    Copied(usize),
     Sent(usize),
 }
 
@@ -91,6 +103,8 @@ struct Simulation {
     decided: Vec<usize>,
     most_decided: usize,
     groups: Vec<Option<Vec<usize>>>,
+    /// Pages in the log of each writer, and those that will be copied.
+    logs: Vec<(f64, f64)>,
     commits: usize,
     writing: f64,
     version: usize,
@@ -114,10 +128,12 @@ fn main() {
         writers: 1,
         group: usize::MAX,
         commit: COMMIT,
+        pages: CANDIDATE_PAGES,
         agent: AGENT,
         seconds: 60.0,
     };
     let many = Plan { walkers: 10_000, agents: 300, cores: 16, shared: false, ..bench };
+    let elsewhere = Plan { commit: 0.1 * COMMIT, pages: 0.1 * CANDIDATE_PAGES, ..many };
     println!(
         "| | cand./s | accepts/s | answer median, ms | 99 %, ms | last agent median, ms | 99 %, ms | not answered, most | waiting for a core | for a decision | for a commit | per commit | cores busy | decision busy | writers busy | network busy | memory, MB |"
     );
@@ -138,13 +154,19 @@ fn main() {
         Plan { name: "10⁴, 1000/s", rate: 1000.0, ..many },
         Plan { name: "10⁴, 1600/s", rate: 1600.0, ..many },
         Plan { name: "10⁴, 3600/s", rate: 3600.0, ..many },
-        Plan { name: "… features of declined ones kept", rate: 3600.0, commit: KEPT, ..many },
+        Plan {
+            name: "… features of declined ones kept",
+            rate: 3600.0,
+            commit: KEPT,
+            pages: KEPT_PAGES,
+            ..many
+        },
         Plan { name: "… 2 cores", rate: 3600.0, cores: 2, ..many },
         Plan { name: "… groups of 64 at most", rate: 3600.0, group: 64, ..many },
         Plan { name: "… 2 shards", rate: 3600.0, writers: 2, ..many },
         Plan { name: "… 4 shards", rate: 3600.0, writers: 4, ..many },
-        Plan { name: "… declined ones elsewhere", rate: 3600.0, commit: 0.1 * COMMIT, ..many },
-        Plan { name: "… the same, maximum", rate: 0.0, commit: 0.1 * COMMIT, ..many },
+        Plan { name: "… declined ones elsewhere", rate: 3600.0, ..elsewhere },
+        Plan { name: "… the same, maximum", rate: 0.0, ..elsewhere },
     ] {
         Simulation::new(plan).run().report();
     }
@@ -165,6 +187,7 @@ impl Simulation {
             decided: Vec::new(),
             most_decided: 0,
             groups: vec![None; plan.writers],
+            logs: vec![(0.0, 0.0); plan.writers],
             commits: 0,
             writing: 0.0,
             version: 0,
@@ -233,10 +256,18 @@ impl Simulation {
                 self.most_decided = self.most_decided.max(self.decided.len());
                 self.write();
             }
-            // The second half of a commit: its turn on a core has come, and it is on disk.
+            // The second part of a commit: its turn on a core has come, and it is on disk. The log may be copied then.
             Event::Written(writer) => {
                 let next = self.cores.leave();
                 self.begin(next);
+                let mut copy = 0.0;
+                if self.logs[writer].0 >= LOG {
+                    copy = COPY * std::mem::take(&mut self.logs[writer]).1;
+                }
+                self.writing += copy;
+                self.after(copy, Event::Copied(writer));
+            }
+            Event::Copied(writer) => {
                 for walker in self.groups[writer].take().unwrap_or_default() {
                     self.commit(walker);
                 }
@@ -254,6 +285,9 @@ impl Simulation {
         }
         let group: Vec<usize> = self.decided.drain(..self.decided.len().min(self.plan.group)).collect();
         let time = FLUSH + group.len() as f64 * self.plan.commit;
+        let new = group.len() as f64 * self.plan.pages;
+        let (pages, copied) = &mut self.logs[writer];
+        (*pages, *copied) = (*pages + PAGES + new, *copied + new);
         self.groups[writer] = Some(group);
         self.commits += 1;
         self.writing += time;
