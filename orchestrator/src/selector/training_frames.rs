@@ -117,3 +117,52 @@ fn part_gamma(mixture: &Mixture, elements: &[usize], features: &[f64]) -> Result
     grades.evaluate(mixture, elements, features, None)?;
     Ok(grades.gamma)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use calm::Component;
+
+    use super::*;
+
+    /// One feature, two elements; γ of an atom is its distance from `centroid`, but for the regularisation.
+    fn mixture(centroid: f64) -> Mixture {
+        let component = Arc::new(Component::new(vec![centroid], vec![1.0], 1.0, None).unwrap());
+        Mixture::new(0, vec![vec![Arc::clone(&component)], vec![component]]).unwrap()
+    }
+
+    fn are(found: &[f64], expected: &[f64]) -> bool {
+        found.len() == expected.len() && found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-3)
+    }
+
+    #[test]
+    fn shares_are_those_of_the_atoms_of_an_element() {
+        let mut frames = TrainingFrames::new(&[1, 0, 1, 1], &[0.5, 2.0, 3.0, 0.25], &mixture(0.0)).unwrap();
+        let third = 1.0 / 3.0;
+        assert_eq!([2, 3].map(|least| frames.shares_of(1, least)), [Some([third; 2]); 2]);
+        assert_eq!((frames.shares_of(1, 4), frames.shares_of(2, 0)), (None, None));
+        assert_eq!(frames.shares_of(0, 1), Some([1.0; 2]));
+        assert!(are(&frames.original, &[2.0, 0.5, 3.0, 0.25]));
+        let original = GradeDistribution::from_grades(&frames.original);
+        assert_eq!((frames.original(), frames.live()), (original, original));
+        // Element 0 would have no atom above 1.
+        frames.regrade(&mixture(2.5), |element| element == 1).unwrap();
+        assert_eq!(frames.shares_of(0, 1), Some([1.0; 2]));
+        assert_eq!(frames.shares_of(1, 3), Some([third, 2.0 * third]));
+        assert!(are(&frames.live, &[2.0, 2.0, 0.5, 2.25]));
+        assert_eq!(frames.live(), GradeDistribution::from_grades(&frames.live));
+        assert_eq!(frames.original(), original);
+        frames.restart();
+        assert_eq!((frames.live(), frames.shares_of(1, 3)), (original, Some([third; 2])));
+    }
+
+    #[test]
+    fn no_atom_is_left_out_however_many_cores_grade() {
+        for atoms in [0, 1, 2, 3, 7, 100] {
+            let features: Vec<f64> = (0..atoms).map(|atom| atom as f64).collect();
+            let frames = TrainingFrames::new(&vec![0; atoms], &features, &mixture(0.0)).unwrap();
+            assert!(are(&frames.live, &features), "{:?}", frames.live);
+        }
+    }
+}

@@ -148,3 +148,98 @@ impl Walk {
         self.is_biased() && self.record.state == WalkEnd::Superseded.name()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use wire::messages::{AssignmentStart, Outcome, PathPosition};
+    use wire::{CandidateBlock, WalkFrame};
+
+    use super::*;
+
+    const ORIGINS: [Origin; 2] = [Origin::Biased, Origin::Control];
+
+    fn walk(origin: Origin, state: &str) -> Walk {
+        let mut walk = Walk::new(WalkId(3), 0, WalkConditions::default(), 0);
+        (walk.record.origin, walk.record.state) = (origin, state.to_owned());
+        walk
+    }
+
+    #[test]
+    fn only_ended_biased_walks_need_controls() {
+        let needs = |origin, state: &str, controlled| {
+            let mut walk = walk(origin, state);
+            (walk.state.accepted_steps, walk.state.controlled) = (vec![10, 20], controlled);
+            walk.needs_control()
+        };
+        assert!(needs(Origin::Biased, "completed", 0) && needs(Origin::Biased, "diverged", 1));
+        assert!(!needs(Origin::Biased, "completed", 2), "each of its structures has one");
+        assert!(!needs(Origin::Biased, "completed", 3));
+        assert!(!needs(Origin::Biased, "running", 0) && !needs(Origin::Biased, "waiting", 0));
+        assert!(!needs(Origin::Control, "completed", 0));
+    }
+
+    #[test]
+    fn limits_end_biased_walks_that_could_go_on() {
+        for end in [WalkEnd::QuotaReached, WalkEnd::Budget, WalkEnd::NothingNew] {
+            assert_eq!(ORIGINS.map(|origin| walk(origin, end.name()).ended_by_budget()), [true, false]);
+        }
+        for end in [WalkEnd::Completed, WalkEnd::Superseded, WalkEnd::VolumeBoundary] {
+            assert_eq!(ORIGINS.map(|origin| walk(origin, end.name()).ended_by_budget()), [false; 2]);
+        }
+        let superseded = |end: &WalkEnd| ORIGINS.map(|origin| walk(origin, end.name()).was_superseded());
+        assert_eq!(superseded(&WalkEnd::Superseded), [true, false]);
+        assert_eq!(superseded(&WalkEnd::Budget), [false; 2]);
+    }
+
+    #[test]
+    fn an_assignment_ends_at_the_last_frame_of_a_control_walk() {
+        let mut control = walk(Origin::Control, "running");
+        control.record.progress.step = 100;
+        control.set_last_step(50);
+        assert_eq!(
+            (control.state.until, control.counted_step(50), control.missed_its_frames()),
+            (150, 100, false)
+        );
+        assert_eq!(control.counted_step(151), 0);
+        control.state.wanted = vec![90, 120];
+        control.set_last_step(50);
+        assert_eq!((control.state.until, control.missed_its_frames()), (120, false));
+        for (step, missed) in [(119, false), (120, true), (121, true)] {
+            control.record.progress.step = step;
+            assert_eq!(control.missed_its_frames(), missed);
+        }
+    }
+
+    #[test]
+    fn each_part_of_an_assignment_has_a_number() {
+        let mut walk = walk(Origin::Biased, "running");
+        let report = |start, frames| AssignmentReport::<CandidateBlock> {
+            walk: WalkId(3),
+            assignment: 7,
+            start,
+            outcome: Outcome::Interrupted,
+            checkpoint: vec![1],
+            progress: WalkProgress { step: 5, ..WalkProgress::default() },
+            trace: Vec::new(),
+            frames,
+        };
+        let position = PathPosition::default();
+        let start =
+            || Some(AssignmentStart { position, mixture_version: 0, threshold_factor: 1.0, verdict: None });
+        let parts = |commit: &Commit| {
+            let assignments: Vec<u64> = commit.assignments.iter().map(|assignment| assignment.part).collect();
+            let trajectories: Vec<u64> = commit.trajectories.iter().map(|part| part.part).collect();
+            (assignments, trajectories)
+        };
+        assert_eq!(parts(&walk.interrupt(report(start(), Vec::new()))), (vec![0], vec![]));
+        // It made no step.
+        assert_eq!(parts(&walk.interrupt(report(None, Vec::new()))), (vec![], vec![]));
+        let commit = walk.interrupt(report(start(), vec![WalkFrame::default()]));
+        assert_eq!(parts(&commit), (vec![1], vec![1]));
+        assert_eq!(walk.state.records, Some(2));
+        let stored = Walk::restore(commit.walks[0].clone()).unwrap();
+        assert_eq!((stored.state, stored.record.progress.step), (walk.state.clone(), 5));
+        walk.state.records = None;
+        assert_eq!(parts(&walk.interrupt(report(start(), Vec::new()))), (vec![], vec![]));
+    }
+}
