@@ -130,8 +130,8 @@ fn same_step(here: &Path, kind: &str) {
     }
 }
 
-/// The same campaign with either, in aluminium alone: the same walks collect at the same steps. Positions differ by rounding, which the
-/// dynamics amplify.
+/// The same campaign with either, in aluminium alone, with the files and the mixture of [`same_step`]: the same walks collect at the same
+/// steps. Positions differ by rounding, which the dynamics amplify.
 fn same_campaign(here: &Path, kind: &str) {
     let eam = config("data/Al_mm.eam.fs").display().to_string();
     let python = format!(

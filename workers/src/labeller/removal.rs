@@ -65,7 +65,7 @@ mod tests {
         };
         remove_directory_by(&directory, killed).unwrap_err();
         assert_eq!(look(), JobDirectory::Missing);
-        // Whoever removes it again, by either name, removes what is left.
+        // A second removal, by either name, removes what is left.
         let left = home.path().join("1-1-0-removed");
         assert!(left.is_dir() && is_being_removed(&left) && !is_being_removed(&directory));
         remove_directory(&directory).unwrap();
